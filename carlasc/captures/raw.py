@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import Float32Array, FloatArray, IntArray, Uint8Array
 from carlasc.core.cameras import CameraModel
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, check_rigid, rotate_vectors
@@ -115,9 +115,9 @@ class SensorRecording:
 
     scan: Scan
     world_T_sensor: Transform
-    velocities: NDArray[np.float64]
+    velocities: FloatArray
 
-    def flow(self) -> NDArray[np.float32]:
+    def flow(self) -> Float32Array:
         """Return (N, 3) float32 velocities of the actors hit by the points, m/s, sensor frame; zero
         for points without an actor.
         """
@@ -180,7 +180,7 @@ class Capture:
         return tuple(sorted(numbers))
 
     @cached_property
-    def frames(self) -> NDArray[np.int64]:
+    def frames(self) -> IntArray:
         """The sorted frame numbers of sensor 0.
 
         A frame is listed if any of its files exists. Reading it raises an error if another file, or
@@ -233,7 +233,7 @@ class Capture:
             scan, check_rigid(arrays["pose"], where["pose"]), arrays["velocities"]
         )
 
-    def read_velocities(self, frame: int) -> dict[int, NDArray[np.float64]]:
+    def read_velocities(self, frame: int) -> dict[int, FloatArray]:
         """Return the (3,) velocity over ground, m/s, world frame, of each actor that a sensor hit
         in a frame, by actor id.
 
@@ -246,7 +246,7 @@ class Capture:
             for kind in ("velocities", "pose")
             for sensor in self.sensors
         ]
-        files, by_actor = self.tree.read_many(paths), dict[int, NDArray[np.float64]]()
+        files, by_actor = self.tree.read_many(paths), dict[int, FloatArray]()
         half = len(self.sensors)
         for row, (path, data) in enumerate(zip(paths[:half], files[:half], strict=True)):
             rows = parse_npy(data, FORMATS["velocities"], where := self.tree.where(path))
@@ -267,7 +267,7 @@ class Capture:
         path = self._folder + array_path("pose", sensor, frame)
         return self._pose_of(path, self.tree.read(path))
 
-    def read_poses(self, sensor: int, frames: Iterable[int]) -> NDArray[np.float64]:
+    def read_poses(self, sensor: int, frames: Iterable[int]) -> FloatArray:
         """Return (F, 4, 4) float64 world_T_sensor of several frames, requested together; NaN for
         poses that cannot be read.
         """
@@ -350,7 +350,7 @@ class Capture:
             name for name in names if self.tree.is_file(self._folder + image_path(name, frame))
         )
 
-    def read_images(self, frame: int) -> dict[str, NDArray[np.uint8]]:
+    def read_images(self, frame: int) -> dict[str, Uint8Array]:
         """Return the image files of a frame as bytes, by their layout names."""
         names = self.image_fields(frame)
         files = self.tree.read_many([self._folder + image_path(name, frame) for name in names])

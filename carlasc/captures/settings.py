@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray
 from carlasc.core.choices import TrafficLevel as TrafficLevel  # noqa: PLC0414 (part of this module)
 from carlasc.errors import ArgumentError
 
@@ -97,7 +97,7 @@ class Lidar:
             raise ArgumentError("noise_m", expected="0 m or more", found=str(self.noise_m))
 
     @cached_property
-    def directions(self) -> NDArray[np.float64]:
+    def directions(self) -> FloatArray:
         """(R, 3) unit vectors of the rays in the sensor frame.
 
         Channels are ordered from the highest to the lowest. The azimuth of the rays of a channel
@@ -114,7 +114,7 @@ class Lidar:
         return np.stack(rays, axis=-1).reshape(-1, 3)
 
 
-def sensor_offsets(sensors: int, rng: np.random.Generator) -> NDArray[np.float64]:
+def sensor_offsets(sensors: int, rng: np.random.Generator) -> FloatArray:
     """Draw random positions of the sensors.
 
     Args:

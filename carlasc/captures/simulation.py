@@ -15,12 +15,12 @@ from functools import cached_property, partial
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.captures.raw import Capture, SensorRecording
 from carlasc.captures.recorders import load_recorder
 from carlasc.captures.settings import Lidar, TrafficLevel, check_at_least
 from carlasc.captures.writing import CaptureWriter, TimesLog
+from carlasc.core.arrays import FloatArray, IntArray, Uint8Array
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import Transform
 from carlasc.core.tables import CARLA
@@ -93,7 +93,7 @@ class Simulator(Capture, ABC):
         """Return the (4, 4) float64 world_T_sensor of a frame."""
 
     @abstractmethod
-    def read_velocities(self, frame: int) -> dict[int, NDArray[np.float64]]:
+    def read_velocities(self, frame: int) -> dict[int, FloatArray]:
         """Return the (3,) velocity over ground, m/s, world frame, of each actor in a frame."""
 
     def make_cameras(self, names: Sequence[str]) -> tuple[CameraModel, ...]:
@@ -119,11 +119,11 @@ class Simulator(Capture, ABC):
         return tuple(range(self._sensors))
 
     @cached_property
-    def frames(self) -> NDArray[np.int64]:
+    def frames(self) -> IntArray:
         """The frame numbers."""
         return np.array(self._frames, np.int64)
 
-    def read_poses(self, sensor: int, frames: Iterable[int]) -> NDArray[np.float64]:
+    def read_poses(self, sensor: int, frames: Iterable[int]) -> FloatArray:
         """Return (F, 4, 4) world_T_sensor of several frames."""
         return np.stack([self.read_pose(sensor, frame) for frame in frames])
 
@@ -143,7 +143,7 @@ class Simulator(Capture, ABC):
         """Return the layout names of the images of a frame."""
         return ()
 
-    def read_images(self, frame: int) -> dict[str, NDArray[np.uint8]]:
+    def read_images(self, frame: int) -> dict[str, Uint8Array]:
         """Return the image files of a frame as bytes, by their layout names."""
         return {}
 

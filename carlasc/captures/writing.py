@@ -9,7 +9,6 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.captures.raw import (
     FOLDERS,
@@ -22,6 +21,7 @@ from carlasc.captures.raw import (
     parse_times,
     times_path,
 )
+from carlasc.core.arrays import AnyArray, Uint8Array
 from carlasc.core.geometry import check_rigid
 from carlasc.errors import ConflictError, FormatError
 from carlasc.storage.files import has_content, parse_json, remove_stale, to_json
@@ -151,7 +151,7 @@ class CaptureWriter:
                 expected="a scan with labels and instances",
                 found="a scan without one of them",
             )
-        arrays: dict[str, NDArray[Any]] = {
+        arrays: dict[str, AnyArray] = {
             "points": scan.points,
             "labels": scan.labels,
             "instances": scan.instances,
@@ -215,7 +215,7 @@ class CaptureWriter:
         """Write the bird's-eye picture of a frame, given as JPEG bytes."""
         self.target.put(bev_path(frame), jpeg)
 
-    def write_images(self, frame: int, images: Mapping[str, NDArray[np.uint8]]) -> None:
+    def write_images(self, frame: int, images: Mapping[str, Uint8Array]) -> None:
         """Write the images of a frame, given as the bytes of their files by field."""
         self.target.put_many(
             {image_path(field, frame): data.data for field, data in images.items()}

@@ -12,9 +12,8 @@ from contextlib import closing
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from carlasc.core.arrays import Float32Array, LabelArray
+from carlasc.core.arrays import Float32Array, LabelArray, Uint32Array
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
 from carlasc.motion.paths import estimate_path, is_static
@@ -49,7 +48,7 @@ class ActorObservation:
 def find_actors(
     points: Float32Array,
     labels: LabelArray,
-    instances: NDArray[np.uint32],
+    instances: Uint32Array,
     classes: ClassTable,
 ) -> tuple[ActorObservation, ...]:
     """Return the numbered actors of a scan that may move: those of moving classes, or of movable

@@ -6,13 +6,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting.protocol import Cloud, FrameHandle, Sensor, Trajectory
-from carlasc.core.arrays import Float32Array, FloatArray, LabelArray
+from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, LabelArray, Uint32Array
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.errors import CarlascError, FormatError, describe
 from carlasc.motion.odometry import move_each, ticks_of
@@ -65,8 +63,8 @@ class Assembled:
 
     points: Float32Array
     labels: LabelArray | None
-    instances: NDArray[np.uint32] | None
-    fields: dict[str, NDArray[Any]]
+    instances: Uint32Array | None
+    fields: dict[str, AnyArray]
 
 
 def read_scan(handle: FrameHandle, rig: Rig, motion: VehicleMotion | None) -> Assembled:
@@ -118,7 +116,7 @@ def assemble(
         _check(cloud, rig, where)
     placed = [_place(cloud, rig, motion) for cloud in clouds]
     points = np.concatenate([points for points, _ in placed]) if len(placed) > 1 else placed[0][0]
-    fields: dict[str, NDArray[Any]] = {}
+    fields: dict[str, AnyArray] = {}
     if len(rig.sensors) > 1:
         fields["sensor"] = np.concatenate(
             [np.full(len(cloud.points), cloud.sensor, np.uint8) for cloud in clouds]
@@ -241,8 +239,8 @@ def _moved(scan_T_points: Transform, points: Float32Array) -> Float32Array:
 
 
 def _joined(
-    parts: Sequence[NDArray[Any] | None], clouds: Sequence[Cloud], dtype: type
-) -> NDArray[Any] | None:
+    parts: Sequence[AnyArray | None], clouds: Sequence[Cloud], dtype: type
+) -> AnyArray | None:
     """Return the values of all clouds; 0 for those of clouds that have none; None if no cloud has
     any.
     """
@@ -250,14 +248,14 @@ def _joined(
         return None
     if len(parts) == 1:
         return parts[0] if dtype is np.uint32 else np.asarray(parts[0], dtype)
-    filled: list[NDArray[Any]] = [
+    filled: list[AnyArray] = [
         np.zeros(len(cloud.points), dtype) if part is None else part.astype(dtype)
         for part, cloud in zip(parts, clouds, strict=True)
     ]
     return np.concatenate(filled)
 
 
-def _other(cloud: Cloud, name: str, rig: Rig, where: str) -> NDArray[Any]:
+def _other(cloud: Cloud, name: str, rig: Rig, where: str) -> AnyArray:
     if name not in cloud.others:
         sensor = rig.sensors[cloud.sensor].name
         raise FormatError(

@@ -20,9 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from numpy.typing import NDArray
-
 from carlasc import storage
+from carlasc.core.arrays import AnyArray
 
 Files = Mapping[str, bytes | memoryview]
 """Bytes of files, by their path in a folder."""
@@ -142,7 +141,7 @@ class SequenceFile(AbstractContextManager["SequenceFile"]):
     """A file that is being written and takes the frames of a sequence one by one."""
 
     @abstractmethod
-    def add(self, frame: int, content: Mapping[str, NDArray[Any]]) -> None:
+    def add(self, frame: int, content: Mapping[str, AnyArray]) -> None:
         """Write a frame, whose arrays have the shapes that `make_frame` gives them, (N, ...) for N
         points. Frames come in increasing order.
 
@@ -177,7 +176,7 @@ class SequenceExporter(Exporter):
         """
 
     @abstractmethod
-    def make_frame(self, sequence: storage.Sequence, frame: int) -> Mapping[str, NDArray[Any]]:
+    def make_frame(self, sequence: storage.Sequence, frame: int) -> Mapping[str, AnyArray]:
         """Return the arrays of a frame by name, of shape (N, ...) for N points.
 
         Raises:

@@ -11,8 +11,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from numpy.typing import NDArray
-
 from carlasc import storage
 from carlasc.converting.exporter import (
     Exported,
@@ -23,6 +21,7 @@ from carlasc.converting.exporter import (
 )
 from carlasc.converting.registry import load_exporter, read_options
 from carlasc.converting.results import ExportResult, Failure, check_outside
+from carlasc.core.arrays import AnyArray
 from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError, StorageError
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Part, Run, StepCounter
@@ -345,7 +344,7 @@ def _write_frame(job: ExportJob) -> str | None:
     return None
 
 
-def _make_frame(job: ExportJob) -> Mapping[str, NDArray[Any]] | str:
+def _make_frame(job: ExportJob) -> Mapping[str, AnyArray] | str:
     """Return the arrays of a frame, or the error message if it cannot be done."""
     assert isinstance(job.exporter, SequenceExporter)
     try:
@@ -354,7 +353,7 @@ def _make_frame(job: ExportJob) -> Mapping[str, NDArray[Any]] | str:
         return str(error)
 
 
-def _add(file: SequenceFile, frame: int, content: Mapping[str, NDArray[Any]]) -> str | None:
+def _add(file: SequenceFile, frame: int, content: Mapping[str, AnyArray]) -> str | None:
     try:
         file.add(frame, content)
     except CarlascError as error:

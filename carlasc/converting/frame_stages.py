@@ -11,22 +11,23 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting.actors import ActorObservation, Velocity, find_actors
 from carlasc.converting.assembling import Assembled, Rig, VehicleMotion, read_scan
 from carlasc.converting.layout_options import AxesAndClasses
 from carlasc.converting.protocol import FrameHandle
 from carlasc.core.arrays import (
+    AnyArray,
     AnyFloatArray,
     BoolArray,
     Float32Array,
     FloatArray,
     IntArray,
     LabelArray,
+    Uint32Array,
 )
 from carlasc.core.axes import mirror_boxes, mirror_grid, mirror_points
 from carlasc.core.boxes import Boxes
@@ -45,7 +46,7 @@ VOXEL_FILES = "voxels_kitti"
 write them again.
 """
 
-Fields = Mapping[str, NDArray[Any]]
+Fields = Mapping[str, AnyArray]
 """Arrays of a frame by the names of their fields, in the order in which they are written."""
 
 Item = TypeVar("Item")
@@ -201,7 +202,7 @@ class ScanBlock(StageBlock[ScanJob]):
 
     def make(self, job: ScanJob, frame: ConvertedFrame) -> Fields:
         """Read a frame, and return the fields of its scan and of its own voxel grid."""
-        fields: dict[str, NDArray[Any]] = {}
+        fields: dict[str, AnyArray] = {}
         if job.write or self.for_odometry or self.for_actors:
             scan, classes = read_scan(job.handle, self.rig, job.motion), self.target.source
             if self.for_odometry:
@@ -217,7 +218,7 @@ class ScanBlock(StageBlock[ScanJob]):
         return fields
 
 
-def make_fields(scan: Assembled, target: AxesAndClasses, where: str) -> dict[str, NDArray[Any]]:
+def make_fields(scan: Assembled, target: AxesAndClasses, where: str) -> dict[str, AnyArray]:
     """Return the fields of a scan in the axes and classes of the target, points last: a frame that
     has points is complete.
 
@@ -229,7 +230,7 @@ def make_fields(scan: Assembled, target: AxesAndClasses, where: str) -> dict[str
     Raises:
         FormatError: a class id is unknown.
     """
-    fields: dict[str, NDArray[Any]] = {}
+    fields: dict[str, AnyArray] = {}
     if scan.labels is not None:
         fields["labels"] = target.map_labels(scan.labels, f"labels of {where}")
     if scan.instances is not None:
@@ -243,7 +244,7 @@ def make_fields(scan: Assembled, target: AxesAndClasses, where: str) -> dict[str
 
 def _voxel_fields(
     handle: FrameHandle, spec: GridSpec, target: AxesAndClasses, writer: SequenceWriter
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, AnyArray]:
     """Return the fields of the frame's own voxel grid, and keep its files; empty if it has none, or
     if it is written already.
     """
@@ -343,7 +344,7 @@ def _by_boxes(job: MotionJob, block: MotionBlock) -> Fields:
     segments = segment_by_boxes(
         job.handle.number, scan, job.first_T_scan, job.tracks, ground=classes.ground
     )
-    fields: dict[str, NDArray[Any]] = {}
+    fields: dict[str, AnyArray] = {}
     if labels is None:
         fields["labels"] = _labels_of(scan.points, segments, classes, _labelled_nearby(job, block))
     if "instances" not in written:
@@ -367,7 +368,7 @@ def _labels_of(
     segments: list[Segment],
     classes: ClassTable,
     labelled: list[tuple[FloatArray, LabelArray]],
-) -> NDArray[np.uint32]:
+) -> Uint32Array:
     """Return the class of each point: the class of its box, of labelled points nearby, ground, or
     geometry without a class.
     """
@@ -431,7 +432,7 @@ def labels_nearby(
     ground: BoolArray,
     labelled: Sequence[tuple[AnyFloatArray, LabelArray]],
     classes: ClassTable,
-) -> NDArray[np.uint32]:
+) -> Uint32Array:
     """Return the most frequent class of the labelled points near each point.
 
     Points on the ground get classes of the ground, others get other classes. Classes of actors are
@@ -471,7 +472,7 @@ def _by_cells(
     places: AnyFloatArray,
     labels: IntArray,
     size: float,
-) -> NDArray[np.uint32]:
+) -> Uint32Array:
     """Return the most frequent label in the cell of each point, the lowest of several; 0 where the
     cell is empty.
     """

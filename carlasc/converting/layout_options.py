@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting.protocol import Converter
-from carlasc.core.arrays import LabelArray
+from carlasc.core.arrays import LabelArray, Uint32Array
 from carlasc.core.choices import FlowSource as FlowSource  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import Images as Images  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable, Remap
@@ -98,7 +97,7 @@ class AxesAndClasses:
         """Table of the ids that are written."""
         return self.source if self.remap is None else self.remap.target
 
-    def map_labels(self, labels: LabelArray, where: str) -> NDArray[np.uint32]:
+    def map_labels(self, labels: LabelArray, where: str) -> Uint32Array:
         """Return the ids that are written for the ids that were read.
 
         Raises:
@@ -124,7 +123,7 @@ class AxesAndClasses:
 
 
 @lru_cache(maxsize=8)
-def _lookup_table(ids: tuple[int, ...], targets: tuple[int, ...]) -> NDArray[np.uint32]:
+def _lookup_table(ids: tuple[int, ...], targets: tuple[int, ...]) -> Uint32Array:
     """Return the target of every 16-bit id, `_UNKNOWN` where it has none."""
     lookup = np.full(_IDS, _UNKNOWN, np.uint32)
     lookup[list(ids)] = targets

@@ -19,12 +19,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from carlasc.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray, LabelArray
+from carlasc.core.arrays import (
+    AnyArray,
+    AnyFloatArray,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    LabelArray,
+    Uint32Array,
+)
 from carlasc.core.boxes import Boxes
 from carlasc.core.cameras import CameraModel
 from carlasc.core.classes import ClassTable, Remap
@@ -94,10 +101,10 @@ class Cloud:
 
     points: Float32Array
     labels: LabelArray | None = None
-    instances: NDArray[np.uint32] | None = None
+    instances: Uint32Array | None = None
     seconds: AnyFloatArray | None = None
     origins: Float32Array | None = None
-    others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    others: Mapping[str, AnyArray] = field(default_factory=dict)
     sensor: int = 0
 
     def __post_init__(self) -> None:

@@ -10,12 +10,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.arrays import Float32Array, FloatArray
+from carlasc.core.arrays import AnyArray, Float32Array, FloatArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
@@ -66,7 +66,7 @@ def mirror_boxes(boxes: Boxes) -> Boxes:
 
 def mirror_grid(grid: NDArray[_Scalar]) -> NDArray[_Scalar]:
     """Mirror an (X, Y, Z) grid along its second axis: y (Cartesian) or azimuth (cylindrical)."""
-    mirrored: NDArray[Any] = grid[:, ::-1]
+    mirrored: AnyArray = grid[:, ::-1]
     return mirrored
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.core.arrays import (
     AnyFloatArray,
@@ -14,6 +13,8 @@ from carlasc.core.arrays import (
     FloatArray,
     IntArray,
     LabelArray,
+    RecordArray,
+    Uint32Array,
 )
 from carlasc.core.geometry import (
     Transform,
@@ -68,8 +69,8 @@ class Boxes:
             quaternion is not a rotation, or a track is 0 or occurs twice.
     """
 
-    tracks: NDArray[np.uint32]
-    labels: NDArray[np.uint32]
+    tracks: Uint32Array
+    labels: Uint32Array
     centers: FloatArray
     quaternions: FloatArray
     sizes: FloatArray
@@ -153,7 +154,7 @@ class Boxes:
         )
 
     @classmethod
-    def from_table(cls, table: NDArray[np.void], where: str = "boxes") -> Boxes:
+    def from_table(cls, table: RecordArray, where: str = "boxes") -> Boxes:
         """Return the boxes of a table, (N,) `BOXES_DTYPE`; `where` is the file named in errors.
 
         Raises:
@@ -175,7 +176,7 @@ class Boxes:
         except FormatError as error:
             raise (error if where == "boxes" else error.within(where)) from error
 
-    def to_table(self) -> NDArray[np.void]:
+    def to_table(self) -> RecordArray:
         """Return the boxes as a table, (N,) `BOXES_DTYPE`."""
         table = np.empty(len(self), BOXES_DTYPE)
         table["track"], table["label"], table["annotated"] = (

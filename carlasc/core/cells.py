@@ -15,9 +15,8 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from carlasc.core.arrays import AnyFloatArray, BoolArray, IntArray
+from carlasc.core.arrays import AnyFloatArray, BoolArray, Int32Array, IntArray
 from carlasc.core.compiling import cached, fused, inlined, jit
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import GridSpec
@@ -187,8 +186,8 @@ def count_points(
     points: AnyFloatArray,
     grid_T_points: Transform,
     spec: GridSpec,
-    counts: NDArray[np.int32] | None = None,
-) -> NDArray[np.int32]:
+    counts: Int32Array | None = None,
+) -> Int32Array:
     """Return the number of points per voxel, (V,).
 
     Same result as with `GridSpec.flat_index`, with less memory.
@@ -206,7 +205,7 @@ def count_points(
 
 
 @cached
-def _count(points: AnyFloatArray, pose: Pose, cells: Cells, counts: NDArray[np.int32]) -> None:
+def _count(points: AnyFloatArray, pose: Pose, cells: Cells, counts: Int32Array) -> None:
     for i in range(len(points)):
         point = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         x, y, z = transform(pose, point[0], point[1], point[2])

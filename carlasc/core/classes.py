@@ -13,9 +13,8 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from carlasc.core.arrays import AnyIntArray, FloatArray, LabelArray
+from carlasc.core.arrays import AnyIntArray, FloatArray, Int32Array, LabelArray, Uint8Array
 from carlasc.errors import ArgumentError, FormatError
 
 Color = tuple[int, int, int]
@@ -183,7 +182,7 @@ class ClassTable:
         return np.dtype(np.uint8 if self.num_channels <= 256 else np.uint16)
 
     @cached_property
-    def palette(self) -> NDArray[np.uint8]:
+    def palette(self) -> Uint8Array:
         """(num_channels, 3) uint8 RGB by id; ids without a colour are grey."""
         palette = np.full((self.num_channels, 3), 128, np.uint8)
         for index, color in self.colors.items():
@@ -247,7 +246,7 @@ class Remap:
                 )
 
     @cached_property
-    def table(self) -> NDArray[np.int32]:
+    def table(self) -> Int32Array:
         """(max id + 1,) int32 lookup table by input id; -1 for ids that are not in the mapping."""
         table = np.full(max(self.mapping) + 1, -1, np.int32)
         table[list(self.mapping)] = list(self.mapping.values())

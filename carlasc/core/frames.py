@@ -6,12 +6,11 @@ from __future__ import annotations
 
 import operator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from carlasc.core.arrays import AnyIntArray, FloatArray, IntArray
+from carlasc.core.arrays import AnyArray, AnyIntArray, FloatArray, IntArray
 from carlasc.errors import ArgumentError, FormatError
 
 
@@ -104,7 +103,7 @@ class FrameRange:
         )
         return inside and (self.only is None or frame in self.only)
 
-    def select(self, frames: NDArray[Any]) -> NDArray[Any]:
+    def select(self, frames: AnyArray) -> AnyArray:
         """Return the (M,) frame numbers out of (N,) that are in the range, in their order."""
         chosen = np.ones(len(frames), np.bool_)
         if self.start is not None:

@@ -14,15 +14,17 @@ from enum import IntFlag
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.core.arrays import (
+    AnyArray,
     AnyFloatArray,
     AnyIntArray,
     BoolArray,
     FloatArray,
+    Int32Array,
     IntArray,
     LabelArray,
+    Uint8Array,
 )
 from carlasc.core.choices import Coordinates as Coordinates  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import Preset
@@ -278,7 +280,7 @@ class GridSpec:
         radius, azimuth, z = np.moveaxis(axes, -1, 0)
         return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1)
 
-    def index(self, axes: AnyFloatArray) -> tuple[NDArray[np.int32], BoolArray]:
+    def index(self, axes: AnyFloatArray) -> tuple[Int32Array, BoolArray]:
         """Return the cells of points on the axes of the grid: half-open, floor, clip; see
         `docs/format.md#cells`.
 
@@ -305,10 +307,10 @@ class GridSpec:
     def seen_from_above(
         self,
         labels: AnyIntArray,
-        palette: NDArray[np.uint8] | None = None,
+        palette: Uint8Array | None = None,
         *,
         left_handed: bool = True,
-    ) -> NDArray[np.uint8]:
+    ) -> Uint8Array:
         """Return a small picture, (H, W, 3) RGB, of the highest occupied voxel of each column: x
         points up, y to the right.
 
@@ -375,7 +377,7 @@ class Grid:
 
     spec: GridSpec
     labels: LabelArray
-    counts: NDArray[Any] | None = None
+    counts: AnyArray | None = None
 
     def __post_init__(self) -> None:
         for name, array in (("labels", self.labels), ("counts", self.counts)):

@@ -9,18 +9,14 @@ import zlib
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
+from carlasc.core.arrays import Uint8Array
 from carlasc.errors import DependencyError
 
 if TYPE_CHECKING:
     import pandas
 
 
-def describe(
-    title: str, rows: Mapping[str, object], picture: NDArray[np.uint8] | None = None
-) -> str:
+def describe(title: str, rows: Mapping[str, object], picture: Uint8Array | None = None) -> str:
     """Return HTML with a title, a table, and an optional picture, (H, W, 3) uint8 RGB."""
     lines = "".join(
         f"<tr><th style='text-align:left'>{html.escape(name)}</th><td "
@@ -55,7 +51,7 @@ def data_frame(rows: Iterable[Mapping[str, object]], index: str) -> pandas.DataF
     return table if table.empty else table.set_index(index)
 
 
-def _png(rgb: NDArray[np.uint8]) -> str:
+def _png(rgb: Uint8Array) -> str:
     """Return an (H, W, 3) picture as a PNG file in base64, without Pillow, which is optional."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:

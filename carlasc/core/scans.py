@@ -7,16 +7,19 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.core.arrays import (
+    AnyArray,
     AnyFloatArray,
     AnyIntArray,
     BoolArray,
     Float32Array,
     FloatArray,
+    Int32Array,
     IntArray,
     LabelArray,
+    Uint16Array,
+    Uint32Array,
 )
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert, transform_points, translation
@@ -49,9 +52,9 @@ class Scan:
     points: Float32Array
     labels: LabelArray | None = None
     flow: Float32Array | None = None
-    instances: NDArray[np.uint32] | None = None
+    instances: Uint32Array | None = None
     remission: Float32Array | None = None
-    others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    others: Mapping[str, AnyArray] = field(default_factory=dict)
     boxes: Boxes | None = None
 
     def __post_init__(self) -> None:
@@ -115,7 +118,7 @@ class Scan:
         fields. Boxes are kept.
         """
 
-        def chosen(values: NDArray[Any] | None) -> NDArray[Any] | None:
+        def chosen(values: AnyArray | None) -> AnyArray | None:
             return None if values is None else values[keep]
 
         return Scan(
@@ -173,8 +176,8 @@ class RaysFromPlace:
     part: slice
     sensor_T_place: Transform
     points: Float32Array
-    order: NDArray[np.int32]
-    azimuth: NDArray[np.uint16]
+    order: Int32Array
+    azimuth: Uint16Array
 
     @classmethod
     def of(cls, points: Float32Array, part: slice, origin: AnyFloatArray) -> RaysFromPlace:
@@ -187,9 +190,7 @@ class RaysFromPlace:
         order = np.argsort(azimuth, kind="stable").astype(np.int32)
         return cls(part, translation(origin), own, order, azimuth[order])
 
-    def through(
-        self, box_T_sensor: Transform, lower: FloatArray, upper: FloatArray
-    ) -> NDArray[np.int32]:
+    def through(self, box_T_sensor: Transform, lower: FloatArray, upper: FloatArray) -> Int32Array:
         """Return the indices of the points whose rays, from the origin to the point, intersect a
         box.
 
@@ -211,7 +212,7 @@ class RaysFromPlace:
 
     def _in_view_of(
         self, box_T_sensor: Transform, lower: FloatArray, upper: FloatArray
-    ) -> NDArray[np.int32]:
+    ) -> Int32Array:
         """Return the indices of the points in the range of azimuths that a box covers."""
         origin = box_T_sensor[:3, 3]
         # the sensor is above, below or inside the box

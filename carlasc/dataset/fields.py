@@ -8,6 +8,14 @@ from typing import Any, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import (
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    Uint8Array,
+    Uint16Array,
+)
 from carlasc.core.cameras import CameraModel
 from carlasc.errors import import_extra
 
@@ -42,27 +50,27 @@ class Sample(TypedDict, total=False):
     For shapes and units, see `Dataset`.
     """
 
-    occupancy: NDArray[np.uint8]
-    density: NDArray[np.uint16]
-    visibility: NDArray[np.uint8]
+    occupancy: Uint8Array
+    density: Uint16Array
+    visibility: Uint8Array
     labels: NDArray[np.unsignedinteger[Any]]
-    known: NDArray[np.bool_]
-    counts: NDArray[np.float32]
-    posterior: NDArray[np.float32]
-    occupied: NDArray[np.float32]
-    flags: NDArray[np.uint8]
-    views: NDArray[np.uint16]
-    instances: NDArray[np.int64]
-    voxel_flow: NDArray[np.float32]
-    camera_visible: NDArray[np.uint8]
-    images: Mapping[str, NDArray[np.uint8]]
+    known: BoolArray
+    counts: Float32Array
+    posterior: Float32Array
+    occupied: Float32Array
+    flags: Uint8Array
+    views: Uint16Array
+    instances: IntArray
+    voxel_flow: Float32Array
+    camera_visible: Uint8Array
+    images: Mapping[str, Uint8Array]
     cameras: Mapping[str, CameraModel]
-    points: NDArray[np.float32]
+    points: Float32Array
     point_labels: NDArray[np.unsignedinteger[Any]]
-    flow: NDArray[np.float32]
-    remission: NDArray[np.float32]
-    poses: NDArray[np.float64]
-    valid: NDArray[np.bool_]
+    flow: Float32Array
+    remission: Float32Array
+    poses: FloatArray
+    valid: BoolArray
     sequence: str
     frame: int
 

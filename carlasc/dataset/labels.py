@@ -6,11 +6,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from carlasc.core.arrays import AnyArray, AnyFloatArray, BoolArray, Float32Array, LabelArray
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.grids import VoxelFlag, is_confident
 from carlasc.core.tables import benchmark_remap, remap_named
@@ -48,9 +48,7 @@ class LabelMap:
             self._remap.table if self._remap else np.arange(classes.num_channels, dtype=np.int32)
         )
 
-    def __call__(
-        self, labels: NDArray[np.unsignedinteger], where: str
-    ) -> NDArray[np.unsignedinteger]:
+    def __call__(self, labels: LabelArray, where: str) -> LabelArray:
         """Map labels of any shape to the target table, in its dtype.
 
         Raises:
@@ -161,7 +159,7 @@ class GridFields:
             FormatError: the content of a file is not valid; the message names the file.
         """
 
-        def read(part: str) -> NDArray[Any]:
+        def read(part: str) -> AnyArray:
             return grids.read(f"{grid}/{part}", frame)
 
         def where(part: str) -> str:
@@ -200,12 +198,12 @@ class GridFields:
 
 
 def soft_labels(
-    occupied: NDArray[np.floating],
-    classes: NDArray[Any],
-    known: NDArray[np.bool_],
+    occupied: AnyFloatArray,
+    classes: AnyArray,
+    known: BoolArray,
     label_map: LabelMap,
     where: str,
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """Return the probability of each class in each voxel.
 
     If a voxel is occupied with probability p, and by a class with probability c given that it is

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import IntArray, Uint8Array
 from carlasc.dataset.fields import Sample, Values
 from carlasc.errors import ArgumentError, MissingDataError, import_extra
 from carlasc.storage import Sequence, layout
@@ -23,7 +23,7 @@ OF_CAMERAS = frozenset({"images", "cameras"})
 """The fields of a sample that come from cameras."""
 
 
-def frames_with_images(scans: Sequence, frames: NDArray[np.int64]) -> NDArray[np.int64]:
+def frames_with_images(scans: Sequence, frames: IntArray) -> IntArray:
     """Return the frames for which every camera of a sequence has an image.
 
     Raises:
@@ -92,7 +92,7 @@ class ResizeImages:
         made, size = dict(cast(Values, sample)), (self.width, self.height)
         picture = import_extra("PIL.Image", "render")
         if "images" in made:
-            images: Mapping[str, NDArray[np.uint8]] = made["images"]
+            images: Mapping[str, Uint8Array] = made["images"]
             # when shrinking, Pillow averages over all source pixels
             shrunk = picture.Resampling.BILINEAR
             made["images"] = {

@@ -16,8 +16,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self, SupportsIndex, cast, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Coordinates, GridSpec
 from carlasc.core.notebook import describe
@@ -291,7 +291,7 @@ class Dataset(_MapStyle):
         return part
 
     @property
-    def frames(self) -> tuple[NDArray[np.int64], ...]:
+    def frames(self) -> tuple[IntArray, ...]:
         """(N,) frame numbers of each of `sequences`. Samples are in this order."""
         return tuple(part.frames for part in self._parts)
 
@@ -411,7 +411,7 @@ class Dataset(_MapStyle):
         return self._parts[which], int(self._parts[which].frames[place - self._starts[which]])
 
     def _stacks(
-        self, part: SequenceFrames, past: list[int | None], poses: NDArray[np.float64] | None
+        self, part: SequenceFrames, past: list[int | None], poses: FloatArray | None
     ) -> Values:
         from carlasc.dataset.stacking import stack_scans
 

@@ -19,8 +19,8 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import IntArray
 from carlasc.dataset.samples import Dataset
 from carlasc.errors import ArgumentError, CarlascError
 from carlasc.storage.transport.caching import CachedTree
@@ -135,7 +135,7 @@ class ShardSampler(_Sampler):
             self._next = self._begun = self._drawn = 0
         self.epoch = epoch
 
-    def order(self, epoch: int) -> NDArray[np.int64]:
+    def order(self, epoch: int) -> IntArray:
         """Return the (N,) indices of all samples, for all processes together, in the order of an
         epoch.
         """
@@ -223,9 +223,9 @@ class ShardSampler(_Sampler):
         }
 
 
-def _number_shards(dataset: Dataset, length: int) -> NDArray[np.int64]:
+def _number_shards(dataset: Dataset, length: int) -> IntArray:
     """Return (N,) the shard number of each sample. Numbers are consecutive from 0."""
-    numbers: list[NDArray[np.int64]] = []
+    numbers: list[IntArray] = []
     first = 0
     for frames in dataset.frames:
         if len(frames):
@@ -257,8 +257,8 @@ class ReadAhead:
     def __init__(
         self,
         dataset: Dataset,
-        order: NDArray[np.int64],
-        shards: NDArray[np.int64],
+        order: IntArray,
+        shards: IntArray,
         start: int,
         count: int,
     ) -> None:

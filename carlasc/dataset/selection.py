@@ -12,8 +12,8 @@ from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import Float32Array, FloatArray, IntArray
 from carlasc.core.frames import compact, expand
 from carlasc.core.grids import Coordinates, GridSpec
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, first_names
@@ -43,7 +43,7 @@ class SequenceFrames:
     scans: Sequence
     grids: Sequence | None
     grid: str
-    frames: NDArray[np.int64]
+    frames: IntArray
     fields: tuple[tuple[Sequence, str], ...]
 
     @cached_property
@@ -74,7 +74,7 @@ class SequenceFrames:
             {past for frame in frames for past in self.history(frame, length) if past is not None}
         )
 
-    def current_T_past(self, frame: int, past: list[int | None]) -> NDArray[np.float64]:
+    def current_T_past(self, frame: int, past: list[int | None]) -> FloatArray:
         """Return (T, 4, 4) float64 transforms from past sensor frames to the sensor frame of
         `frame`; the identity for `frame` and for None.
         """
@@ -180,13 +180,13 @@ def find_grid_name(grids: Sequence, grid: str | GridSpec) -> str:
     )
 
 
-def common_frames(wanted: Mapping[tuple[Sequence, str], None]) -> NDArray[np.int64]:
+def common_frames(wanted: Mapping[tuple[Sequence, str], None]) -> IntArray:
     """Return the frames that have all fields of `wanted`.
 
     Raises:
         MissingDataError: no frame of a sequence has a field.
     """
-    common: NDArray[np.int64] | None = None
+    common: IntArray | None = None
     for sequence, field in wanted:
         frames = sequence.frames(field)
         if not len(frames):
@@ -301,11 +301,9 @@ class RecentScans(threading.local):
         """Keep at most `capacity` scans."""
         super().__init__()
         self.capacity = capacity
-        self._scans: OrderedDict[tuple[Sequence, int], NDArray[np.float32]] = OrderedDict()
+        self._scans: OrderedDict[tuple[Sequence, int], Float32Array] = OrderedDict()
 
-    def read(
-        self, sequence: Sequence, frames: list[int | None]
-    ) -> list[NDArray[np.float32] | None]:
+    def read(self, sequence: Sequence, frames: list[int | None]) -> list[Float32Array | None]:
         """Return the points of each frame like `Sequence.read_xyz`, and None for None.
 
         They are valid until the next call.

@@ -17,6 +17,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, Int32Array, LabelArray
 from carlasc.core.cells import AZIMUTH_ERROR, Cells, fast_azimuth, find_voxel
 from carlasc.core.compiling import cached
 from carlasc.core.grids import GridSpec
@@ -25,13 +26,13 @@ _BLOCK = 128  # points per block: their columns and cells take 6 KB of the first
 
 
 def stack_scans(
-    scans: Sequence[NDArray[np.float32] | None],
-    grid_T_scans: NDArray[np.float64],
+    scans: Sequence[Float32Array | None],
+    grid_T_scans: FloatArray,
     spec: GridSpec,
     what: Literal["occupancy", "density"] = "occupancy",
     min_range_m: float | None = None,
     max_range_m: float | None = None,
-) -> NDArray[Any]:
+) -> AnyArray:
     """Bin scans into a stack of grids.
 
     Args:
@@ -66,9 +67,7 @@ def stack_scans(
     return stack
 
 
-def look_up(
-    labels: NDArray[np.unsignedinteger], table: NDArray[np.int32], dtype: np.dtype[Any]
-) -> NDArray[Any] | None:
+def look_up(labels: LabelArray, table: Int32Array, dtype: np.dtype[Any]) -> AnyArray | None:
     """Return `table[labels]` as `dtype`, with the shape of `labels`; None if a label is not in the
     table (after its end, or its value is -1).
     """
@@ -89,7 +88,7 @@ def _geometry(spec: GridSpec) -> tuple[Any, ...]:
     return spec.lower, tuple(1.0 / voxel), sizes, doubt
 
 
-def _as_words(points: NDArray[np.float32]) -> NDArray[np.uint64]:
+def _as_words(points: Float32Array) -> NDArray[np.uint64]:
     """Return the bytes of the points as (2 N,) words: x and y in one, z and the fourth number in
     the next.
     """
@@ -99,7 +98,7 @@ def _as_words(points: NDArray[np.float32]) -> NDArray[np.uint64]:
     return _read_only(words if words.flags.aligned else words.copy())
 
 
-def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+def _read_only(array: AnyArray) -> AnyArray:
     """Return a read-only view, the only array type for which the kernels are compiled."""
     if array.flags.writeable:
         array = array.view()

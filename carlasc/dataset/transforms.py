@@ -10,8 +10,8 @@ from multiprocessing.context import get_spawning_popen
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray
 from carlasc.core.grids import GridSpec
 from carlasc.dataset.fields import Sample, Values
 from carlasc.dataset.labels import OF_GRID
@@ -141,7 +141,7 @@ def flip(sample: Sample, direction: str, spec: GridSpec | None) -> Sample:
     return cast(Sample, flipped)
 
 
-def _flip_grid(grid: NDArray[Any], first: int, column: int, spec: GridSpec) -> NDArray[Any]:
+def _flip_grid(grid: AnyArray, first: int, column: int, spec: GridSpec) -> AnyArray:
     """Mirror an array whose dimension `first` is x or the radius."""
     if spec.coordinates == "cartesian":
         return np.ascontiguousarray(np.flip(grid, first + column))

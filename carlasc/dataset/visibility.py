@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import Float32Array, FloatArray, Uint8Array
 from carlasc.core.grids import GridSpec
 from carlasc.dataset.stacking import stack_scans
 from carlasc.groundtruth.voting.ballot import Observation, count_votes
@@ -20,12 +20,12 @@ _FEWEST_RAYS = 40_000
 
 
 def stack_visibility(
-    scans: Sequence[NDArray[np.float32] | None],
-    grid_T_scans: NDArray[np.float64],
+    scans: Sequence[Float32Array | None],
+    grid_T_scans: FloatArray,
     spec: GridSpec,
     min_range_m: float | None = None,
     max_range_m: float | None = None,
-) -> NDArray[np.uint8]:
+) -> Uint8Array:
     """Trace the rays of scans through a stack of grids.
 
     A ray is sampled from its point back to the sensor, with the shortest edge of a voxel as step,

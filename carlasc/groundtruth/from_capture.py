@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.captures.raw import Capture, SensorRecording, find_captures
+from carlasc.core.arrays import AnyArray, FloatArray
 from carlasc.core.geometry import relative_to
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.groundtruth.inputs import FrameData, FrameInput, GridPlan, SequenceInput, choose_frames
@@ -59,7 +59,7 @@ class CaptureFrame(FrameInput):
         sensors.
         """
         ego = self.capture.read(self.sensors[0], self.source_frame)
-        fields: dict[str, NDArray[Any]] = {
+        fields: dict[str, AnyArray] = {
             "points": np.column_stack([ego.scan.points, np.zeros(len(ego.scan), np.float32)]),
             "labels": _present(ego.scan.labels),
             "flow": ego.flow(),
@@ -145,7 +145,7 @@ class CaptureSequence(SequenceInput):
     def _count_points(self, source_frame: int) -> int:
         return len(self.capture.read(0, source_frame).scan)
 
-    def poses(self) -> NDArray[np.float64]:
+    def poses(self) -> FloatArray:
         """Return inv(pose0[first]) @ pose0[f] for each frame f.
 
         Raises:
@@ -166,7 +166,7 @@ class CaptureSequence(SequenceInput):
         poses = self.capture.read_poses(0, [frame.source_frame for frame in self.frames])
         return relative_to(world_T_first, poses)
 
-    def times(self) -> NDArray[np.float64]:
+    def times(self) -> FloatArray:
         """Return (f - first) * 0.1 for each frame f: see `docs/format.md#votes`."""
         numbers = np.array([frame.source_frame for frame in self.frames])
         return (numbers - numbers[0]) * layout.FRAME_PERIOD_S
@@ -206,7 +206,7 @@ def capture_sequences(
     return [CaptureSequence(capture, path, plan) for path, capture in find_captures(source).items()]
 
 
-def _present(array: NDArray[Any] | None) -> NDArray[Any]:
+def _present(array: AnyArray | None) -> AnyArray:
     if array is None:  # never: Capture.read refuses recordings without labels or instances
         raise FormatError("recording", expected="labels and instances", found="none")
     return array

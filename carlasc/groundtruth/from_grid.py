@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import Uint8Array
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, GridSpec, most_frequent
 from carlasc.errors import ArgumentError, MissingDataError
@@ -65,7 +65,7 @@ def resample(grid: Grid, spec: GridSpec, classes: ClassTable) -> Grid:
     return Grid(spec, coarse.reshape(spec.size), counts.astype(np.float32).reshape(spec.size))
 
 
-def _boxes(fine: Grid, spec: GridSpec) -> NDArray[np.uint8] | None:
+def _boxes(fine: Grid, spec: GridSpec) -> Uint8Array | None:
     """Return the boxes around the occupied cells of a finer grid in each voxel of a coarser one."""
     corners = np.stack(list(np.ndindex(2, 2, 2))) - 0.5
     # a corner on a border would belong to the voxel beside it

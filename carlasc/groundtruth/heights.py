@@ -8,8 +8,8 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import Float32Array, LabelArray
 from carlasc.core.grids import GridSpec
 from carlasc.motion import ground_height, ground_points
 
@@ -29,13 +29,13 @@ class Ground:
         below_m: height of the sensor above the ground under it.
     """
 
-    heights_m: NDArray[np.float32]
+    heights_m: Float32Array
     below_m: float
 
 
 def ground_of(
-    points: NDArray[np.float32], labels: NDArray[np.unsignedinteger] | None, ground: Collection[int]
-) -> NDArray[np.float32]:
+    points: Float32Array, labels: LabelArray | None, ground: Collection[int]
+) -> Float32Array:
     """Return the points on the ground: by their labels, or by their heights if they have none.
 
     Args:
@@ -49,11 +49,11 @@ def ground_of(
     return points[on_ground]
 
 
-def find_ground(scans: Iterable[NDArray[np.float32]], reach_m: float = _REACH_M) -> Ground | None:
+def find_ground(scans: Iterable[Float32Array], reach_m: float = _REACH_M) -> Ground | None:
     """Return the ground in some scans, (N, 3) or (N, 4), within a horizontal distance of the
     sensor; None if there is none.
     """
-    heights: list[NDArray[np.float32]] = []
+    heights: list[Float32Array] = []
     near: list[float] = []
     for points in scans:
         ground = points[ground_points(points), :3]

@@ -15,9 +15,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, get_args
 
-import numpy as np
-from numpy.typing import NDArray
-
+from carlasc.core.arrays import AnyArray, FloatArray, IntArray, Uint8Array
 from carlasc.core.frames import FrameRange
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.errors import ArgumentError, CarlascError, MissingDataError
@@ -123,12 +121,12 @@ class FrameData:
             cameras that see each voxel.
     """
 
-    fields: Mapping[str, NDArray[Any]]
+    fields: Mapping[str, AnyArray]
     grid: Grid
     votes: Votes | None
     evidence: VoxelCertainty | None = None
     actors: VoxelActors | None = None
-    boxes: NDArray[np.uint8] | None = None
+    boxes: Uint8Array | None = None
 
 
 class FrameInput(ABC):
@@ -202,13 +200,13 @@ class SequenceInput(ABC):
         """Return the chosen frames: see `frames`."""
 
     @abstractmethod
-    def poses(self) -> NDArray[np.float64] | None:
+    def poses(self) -> FloatArray | None:
         """Return (F, 4, 4) first_T_sensor by output frame, NaN where a pose cannot be read; None if
         there are no poses.
         """
 
     @abstractmethod
-    def times(self) -> NDArray[np.float64] | None:
+    def times(self) -> FloatArray | None:
         """Return (F,) seconds since the first frame by output frame; None if there are no times."""
 
     def cameras(self) -> bytes | None:
@@ -295,11 +293,11 @@ class StoredSequence(SequenceInput):
             else 0
         )
 
-    def poses(self) -> NDArray[np.float64] | None:
+    def poses(self) -> FloatArray | None:
         """Return the sequence's poses, one per line of poses.txt; None if it has none."""
         return self.sequence.poses if layout.POSES in self.sequence.documents() else None
 
-    def times(self) -> NDArray[np.float64] | None:
+    def times(self) -> FloatArray | None:
         """Return the sequence's times, one per line of times.txt; None if it has none."""
         return self.sequence.times if layout.TIMES in self.sequence.documents() else None
 
@@ -309,7 +307,7 @@ class StoredSequence(SequenceInput):
         return self.sequence.read_document(layout.CAMERAS) if has_cameras else None
 
 
-def choose_frames(frames: FrameRange, available: NDArray[np.int64], where: str) -> list[int]:
+def choose_frames(frames: FrameRange, available: IntArray, where: str) -> list[int]:
     """Return the available frame numbers in a range.
 
     Raises:

@@ -14,8 +14,8 @@ from itertools import groupby
 from typing import Any, Self, TypedDict
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, AnyFloatArray, IntArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, thin, transform_points
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
@@ -50,8 +50,8 @@ class Residual:
     @classmethod
     def between(
         cls,
-        one: NDArray[np.floating],
-        other: NDArray[np.floating],
+        one: AnyFloatArray,
+        other: AnyFloatArray,
         world_T_actor: Transform,
         world_T_next: Transform,
     ) -> Residual:
@@ -153,7 +153,7 @@ def actors_of(
     return tuple(sorted(actors, key=lambda actor: (actor.first, actor.label, actor.instance)))
 
 
-def _distances(one: NDArray[np.floating], other: NDArray[np.floating]) -> NDArray[np.floating]:
+def _distances(one: AnyFloatArray, other: AnyFloatArray) -> AnyFloatArray:
     """Return the distances from some points of each observation to the nearest point of the other,
     metres.
     """
@@ -214,7 +214,7 @@ class PoseFacts:
     left: tuple[tuple[int, int], ...]
 
     @classmethod
-    def of(cls, refined: RefinedPoses, frames: NDArray[np.int64]) -> PoseFacts:
+    def of(cls, refined: RefinedPoses, frames: IntArray) -> PoseFacts:
         """Return the facts of refined poses; `frames` are the numbers of their frames."""
         x, y, z, roll, pitch, yaw = np.sqrt(np.square(refined.changes()).mean(axis=0)).tolist()
         off = refined.given[:, 2, 3] - refined.poses[:, 2, 3]
@@ -247,8 +247,8 @@ class FrameFacts:
     frame: int
     digests: Mapping[str, bytes]
     known: int
-    classes: NDArray[np.int64]
-    votes: NDArray[np.int64]
+    classes: IntArray
+    votes: IntArray
     votes_sum: float
     changes: Changes | None = None
     residuals: Mapping[int, Residual] = field(default_factory=dict)
@@ -258,7 +258,7 @@ class FrameFacts:
     def of(
         cls,
         frame: int,
-        arrays: Mapping[str, NDArray[Any]],
+        arrays: Mapping[str, AnyArray],
         grid: str,
         spec: GridSpec,
         classes: ClassTable,
@@ -308,7 +308,7 @@ class FrameFacts:
         )
 
 
-def _count_inferred(flags: NDArray[Any] | None, counts: NDArray[Any] | None) -> int | None:
+def _count_inferred(flags: AnyArray | None, counts: AnyArray | None) -> int | None:
     """Return the number of known voxels that were inferred, not seen; None if the grid does not
     say.
     """
@@ -332,7 +332,7 @@ def sample_frames(numbers: Sequence[int]) -> frozenset[int]:
     return chosen or frozenset(numbers[len(numbers) // 2 :][:1])
 
 
-def digest_of(field: str, array: NDArray[Any]) -> bytes:
+def digest_of(field: str, array: AnyArray) -> bytes:
     """Return the digest (BLAKE2b, 16 bytes) of a field of a frame: the digest of its published
     file, for all stores.
 
@@ -663,7 +663,7 @@ def short(digest: bytes) -> str:
 
 
 def _coverage(rows: list[FrameFacts], settings: Mapping[str, Any], classes: ClassTable) -> Coverage:
-    by_class: NDArray[np.int64] = sum(
+    by_class: IntArray = sum(
         (row.classes for row in rows), start=np.zeros(classes.num_channels, np.int64)
     )
     votes = sum((row.votes for row in rows), start=np.zeros(1, np.int64))

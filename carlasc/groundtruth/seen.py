@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray, IntArray, Uint8Array
 from carlasc.core.cameras import CameraModel
 from carlasc.core.compiling import cached, jit
 from carlasc.core.geometry import Transform, invert, transform_points
@@ -43,15 +43,13 @@ class _Solid(NamedTuple):
         beyond: (3,) margin of the boxes.
     """
 
-    size: NDArray[np.int64]
-    occupied: NDArray[np.bool_]
-    boxes: NDArray[np.uint8]
-    beyond: NDArray[np.float64]
+    size: IntArray
+    occupied: BoolArray
+    boxes: Uint8Array
+    beyond: FloatArray
 
     @classmethod
-    def of(
-        cls, occupied: NDArray[np.bool_], spec: GridSpec, boxes: NDArray[np.uint8] | None = None
-    ) -> _Solid:
+    def of(cls, occupied: BoolArray, spec: GridSpec, boxes: Uint8Array | None = None) -> _Solid:
         """Return the obstacles of a grid: its occupied voxels, or the boxes around their points
         where these are known.
         """
@@ -84,11 +82,11 @@ def check_views(spec: GridSpec, views: Views, where: str) -> None:
 
 
 def see_voxels(
-    occupied: NDArray[np.bool_],
+    occupied: BoolArray,
     spec: GridSpec,
     views: Views,
-    boxes: NDArray[np.uint8] | None = None,
-) -> NDArray[np.uint8]:
+    boxes: Uint8Array | None = None,
+) -> Uint8Array:
     """Return the cameras that see each voxel.
 
     Args:
@@ -115,9 +113,7 @@ def see_voxels(
     return seen.reshape(spec.size)
 
 
-def _in_front(
-    centers: NDArray[np.float64], camera_T_scan: Transform, is_wide: bool
-) -> NDArray[np.bool_]:
+def _in_front(centers: FloatArray, camera_T_scan: Transform, is_wide: bool) -> BoolArray:
     depth = centers @ camera_T_scan[2, :3] + camera_T_scan[2, 3]
     return np.asarray(depth > (-np.inf if is_wide else 0))
 
@@ -145,11 +141,11 @@ def _mark_seen(voxels, eye, solid, bit, seen):  # type: ignore[no-untyped-def]
 
 
 def see_points(
-    points: NDArray[np.floating],
-    occupied: NDArray[np.bool_],
+    points: AnyFloatArray,
+    occupied: BoolArray,
     spec: GridSpec,
-    eye: NDArray[np.float64],
-) -> NDArray[np.bool_]:
+    eye: FloatArray,
+) -> BoolArray:
     """Return (N,) bool: which points are visible from an eye, because no voxel of a grid hides
     them. Space outside of the grid hides nothing.
 

@@ -10,9 +10,18 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.captures.raw import SensorRecording
+from carlasc.core.arrays import (
+    AnyFloatArray,
+    AnyIntArray,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    LabelArray,
+    RecordArray,
+    Uint32Array,
+)
 from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.motion.segments import MIN_SPEED_M_S
@@ -35,16 +44,16 @@ class VoxelActors:
             of the frame's sensor, ego motion removed.
     """
 
-    instance: NDArray[np.uint32]
-    velocity: NDArray[np.void]
+    instance: Uint32Array
+    velocity: RecordArray
 
     @classmethod
     def of(
         cls,
         spec: GridSpec,
-        instance: NDArray[np.uint32],
-        voxels: NDArray[np.int64],
-        velocity: NDArray[np.floating],
+        instance: Uint32Array,
+        voxels: IntArray,
+        velocity: AnyFloatArray,
     ) -> Self:
         """Return the actors of a grid.
 
@@ -60,7 +69,7 @@ class VoxelActors:
         table["voxel"], table["velocity"] = voxels[fast], velocity[fast]
         return cls(instance.reshape(spec.size), table)
 
-    def within(self, occupied: NDArray[np.bool_]) -> Self:
+    def within(self, occupied: BoolArray) -> Self:
         """Return the actors in the voxels that are occupied, (X, Y, Z)."""
         kept = occupied.reshape(-1)[self.velocity["voxel"]]
         return replace(self, instance=self.instance * occupied, velocity=self.velocity[kept])
@@ -81,9 +90,9 @@ class ActorPoints:
     ) -> None:
         self.spec, self.turns, self.deformable = spec, turns, deformable
         self._counts = np.empty(0, _POINTS_DTYPE)
-        self._velocity: dict[int, NDArray[np.float64]] = {}
+        self._velocity: dict[int, FloatArray] = {}
         # bounds in x, y of turning actors
-        self._extent: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
+        self._extent: dict[int, tuple[FloatArray, FloatArray]] = {}
 
     def add(self, recording: SensorRecording, grid_T_sensor: Transform) -> None:
         """Add the points of a recording; numbers of actors are those of the whole recording."""
@@ -114,7 +123,7 @@ class ActorPoints:
                     np.maximum(upper, places.max(axis=0)),
                 )
 
-    def of(self, labels: NDArray[np.unsignedinteger]) -> VoxelActors:
+    def of(self, labels: LabelArray) -> VoxelActors:
         """Return the actors of a grid with (X, Y, Z) labels: the most frequent number of the points
         of a voxel's class; ties go to the lowest.
         """
@@ -131,7 +140,7 @@ class ActorPoints:
         self._turn(known, velocity)
         return VoxelActors.of(self.spec, instance, known["voxel"].astype(np.int64), velocity)
 
-    def _turn(self, rows: NDArray[np.void], velocity: NDArray[np.float64]) -> None:
+    def _turn(self, rows: RecordArray, velocity: FloatArray) -> None:
         """Add to the velocity of each voxel the turn of its actor about the middle of the points of
         the actor.
         """
@@ -143,7 +152,7 @@ class ActorPoints:
             velocity[own, :2] += self.turns[actor] * np.column_stack([-arm[:, 1], arm[:, 0]])
 
 
-def centers_of(spec: GridSpec, voxels: NDArray[np.integer]) -> NDArray[np.float64]:
+def centers_of(spec: GridSpec, voxels: AnyIntArray) -> FloatArray:
     """Return the (N, 3) centres of voxels, metres, grid frame, from their (N,) flat indices."""
     index = np.stack(np.unravel_index(voxels, spec.size), axis=-1)
     return spec.from_axes(
@@ -151,7 +160,7 @@ def centers_of(spec: GridSpec, voxels: NDArray[np.integer]) -> NDArray[np.float6
     ).astype(np.float64)
 
 
-def _sum(rows: NDArray[np.void]) -> NDArray[np.void]:
+def _sum(rows: RecordArray) -> RecordArray:
     """Return one row for each voxel, class and actor, with the sum of its points."""
     order = np.lexsort((rows["actor"], rows["label"], rows["voxel"]))
     rows = rows[order]

@@ -16,8 +16,7 @@ from functools import cached_property
 from itertools import groupby
 from typing import Any
 
-from numpy.typing import NDArray
-
+from carlasc.core.arrays import AnyArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, is_confident
 from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError, StorageError
@@ -30,7 +29,7 @@ from carlasc.storage import layout
 from carlasc.storage.resuming import check_scan
 from carlasc.storage.sinks import SequenceWriter
 
-Outputs = dict[str, NDArray[Any]]
+Outputs = dict[str, AnyArray]
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from collections.abc import Sequence as Series
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyFloatArray, AnyIntArray, Float32Array, IntArray
 from carlasc.core.axes import choices_of_axes
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.groundtruth.reporting import ActorTrack
@@ -43,9 +43,9 @@ class GroundBelow:
     """
 
     spec: GridSpec
-    _heights: list[NDArray[np.float32]] = field(default_factory=list)
+    _heights: list[Float32Array] = field(default_factory=list)
 
-    def add(self, ground: NDArray[np.float32]) -> None:
+    def add(self, ground: Float32Array) -> None:
         """Add a frame's ground points (N, 3), metres, finite.
 
         Those outside of the grid's other bounds do not count.
@@ -147,13 +147,11 @@ class GridEvidence:
     spec: GridSpec
     # per frame, (1 + mistakes,) number of points in voxels of their class, and in known voxels;
     # first for the data as they are
-    _right: list[NDArray[np.int64]] = field(default_factory=list)
-    _known: list[NDArray[np.int64]] = field(default_factory=list)
+    _right: list[IntArray] = field(default_factory=list)
+    _known: list[IntArray] = field(default_factory=list)
     _occupied: list[float] = field(default_factory=list)
 
-    def add(
-        self, points: NDArray[np.floating], labels: NDArray[np.integer] | None, grid: Grid
-    ) -> None:
+    def add(self, points: AnyFloatArray, labels: AnyIntArray | None, grid: Grid) -> None:
         """Measure one frame.
 
         Args:

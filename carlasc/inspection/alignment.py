@@ -17,14 +17,14 @@ from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray
 from carlasc.core.axes import choices_of_axes
 from carlasc.core.geometry import Transform, invert, transform_points, translation
 from carlasc.inspection.pose_quality import PoseQuality, measure_poses
 from carlasc.inspection.structure import VOXEL_M, occupancy, overlap
 
-Poses: TypeAlias = NDArray[np.float64]
+Poses: TypeAlias = FloatArray
 
 _LEVER_M = 15.0  # motions are compared by how they move a point at this distance
 _DIFFERENT_M = 0.3
@@ -101,11 +101,11 @@ class PoseDiagnosis:
 
 
 def diagnose_poses(
-    structure: Callable[[int], NDArray[np.float64]],
+    structure: Callable[[int], FloatArray],
     poses: Poses,
     *,
-    points: Callable[[int], NDArray[np.floating]] | None = None,
-    seconds: NDArray[np.float64] | None = None,
+    points: Callable[[int], AnyFloatArray] | None = None,
+    seconds: FloatArray | None = None,
     max_pairs: int = 24,
 ) -> PoseDiagnosis:
     """Measure the overlap of scans under their poses, and under the poses with each known mistake
@@ -210,7 +210,7 @@ def relative(poses: Poses, earlier: int, later: int) -> Transform:
 
 
 def _best_correction(
-    shares: NDArray[np.float64], judged: NDArray[np.bool_], corrections: tuple[Correction, ...]
+    shares: FloatArray, judged: BoolArray, corrections: tuple[Correction, ...]
 ) -> tuple[int, float, float] | None:
     """Choose the correction with the best overlap over all pairs.
 
@@ -243,7 +243,7 @@ def _best_correction(
 
 
 def _common_offset(
-    overlaps: list[tuple[NDArray[np.float64], NDArray[np.float64], Transform]],
+    overlaps: list[tuple[FloatArray, FloatArray, Transform]],
 ) -> tuple[float, float, float] | None:
     """Return the median of the offsets at which the later scans of pairs overlap best; None if few
     pairs have a clear one.
@@ -287,7 +287,7 @@ def _partner(poses: Poses, first: int) -> int:
     return last
 
 
-def _thin(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+def _thin(points: FloatArray, count: int) -> FloatArray:
     return points[:: max(1, len(points) // count)]
 
 
@@ -306,7 +306,7 @@ def _transpose(poses: Poses) -> Poses:
     return undone
 
 
-def _in_axes(stored_T_sensor: NDArray[np.float64]) -> Callable[[Poses], Poses]:
+def _in_axes(stored_T_sensor: FloatArray) -> Callable[[Poses], Poses]:
     """Return the correction of a change of axes: `stored_T_sensor` (3, 3) maps the axes of the
     sensor to those of the stored poses.
     """
@@ -315,7 +315,7 @@ def _in_axes(stored_T_sensor: NDArray[np.float64]) -> Callable[[Poses], Poses]:
     return lambda poses: change.T @ poses @ change
 
 
-def _axes_mistakes() -> list[tuple[str, str, NDArray[np.float64]]]:
+def _axes_mistakes() -> list[tuple[str, str, FloatArray]]:
     """Return all 47 other choices of axes and their signs: (description, advice, matrix);
     well-known ones first.
     """

@@ -7,11 +7,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, AnyIntArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import VoxelFlag
@@ -25,7 +24,7 @@ _FASTEST_M_S = 100.0
 _FARTHEST_M = 500.0  # boxes farther from the sensor are in another frame
 _JPEG = b"\xff\xd8"
 
-Arrays = Mapping[str, NDArray[Any]]
+Arrays = Mapping[str, AnyArray]
 """The fields of a frame that could be read, by name."""
 
 
@@ -183,7 +182,7 @@ def check_values(sequence: Sequence, frame: int) -> Iterator[Finding]:
 
     Files that cannot be read are skipped: `check_shapes` reports them.
     """
-    arrays: dict[str, NDArray[Any]] = {}
+    arrays: dict[str, AnyArray] = {}
     for name in _fields(sequence, frame):
         with suppress(CarlascError):
             arrays[name] = sequence.read(name, frame)
@@ -213,7 +212,7 @@ def check_values(sequence: Sequence, frame: int) -> Iterator[Finding]:
         yield from check_evidence(sequence, grid, frame, arrays, classes)
 
 
-def _check_numbers(name: str, array: NDArray[Any], where: str) -> Iterator[Finding]:
+def _check_numbers(name: str, array: AnyArray, where: str) -> Iterator[Finding]:
     finite = np.isfinite(array)
     fastest = float(np.abs(array).max()) if array.size else 0.0
     if not finite.all():
@@ -225,7 +224,7 @@ def _check_numbers(name: str, array: NDArray[Any], where: str) -> Iterator[Findi
         yield Finding("warning", "flow", where, expected, f"{fastest:.0f} m/s")
 
 
-def _check_boxes(array: NDArray[Any], classes: ClassTable, where: str) -> Iterator[Finding]:
+def _check_boxes(array: AnyArray, classes: ClassTable, where: str) -> Iterator[Finding]:
     try:
         boxes = Boxes.from_table(array, where)
     except CarlascError as error:
@@ -300,7 +299,7 @@ def check_evidence(
 
 
 def _mistakes(
-    part: str, array: NDArray[Any], num_voxels: int, classes: ClassTable | None
+    part: str, array: AnyArray, num_voxels: int, classes: ClassTable | None
 ) -> Iterator[tuple[str, str]]:
     """Yield what was expected and what was found, for each kind of mistake."""
     if part == "occupied":
@@ -338,9 +337,7 @@ def _mistakes(
             yield f"probabilities that add up to at most {layout.CERTAIN} per voxel", others
 
 
-def _check_classes(
-    labels: NDArray[np.integer], classes: ClassTable, where: str
-) -> Iterator[Finding]:
+def _check_classes(labels: AnyIntArray, classes: ClassTable, where: str) -> Iterator[Finding]:
     known = np.zeros(classes.num_channels, np.bool_)
     known[list(classes.names)] = True
     if (labels < len(known)).all() and known[labels].all():

@@ -10,8 +10,15 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import (
+    AnyFloatArray,
+    AnyIntArray,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Uint8Array,
+)
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import Grid, GridSpec
@@ -83,8 +90,8 @@ class HeldOutScores:
     classes: ClassTable
     labelled: bool
     frames: int
-    counts: NDArray[np.int64]
-    errors: NDArray[np.int64]
+    counts: IntArray
+    errors: IntArray
     swept_voxels: int = 0
     swept_known: int = 0
     swept_occupied: int = 0
@@ -106,10 +113,10 @@ class HeldOutScores:
         cls,
         grid: Grid,
         classes: ClassTable,
-        points: NDArray[np.floating],
-        labels: NDArray[np.integer] | None,
+        points: AnyFloatArray,
+        labels: AnyIntArray | None,
         grid_T_vehicles: Iterable[Transform] = (),
-        origins: NDArray[np.floating] | None = None,
+        origins: AnyFloatArray | None = None,
     ) -> HeldOutScores:
         """Measure one frame.
 
@@ -137,7 +144,7 @@ class HeldOutScores:
         at_points = labels_at(points, spec, grid.labels, grid.known)[0, 0]
         inside = (at_points != OUTSIDE) & np.any(points != 0, axis=1)
         points, at_points = np.asarray(points[inside], np.float64), at_points[inside]
-        begun: NDArray[np.float64] = (
+        begun: FloatArray = (
             np.zeros_like(points) if origins is None else np.asarray(origins[inside], np.float64)
         )
         kind = (
@@ -232,7 +239,7 @@ class HeldOutScores:
             },
         }
 
-    def _shares(self, counts: NDArray[np.int64], errors: NDArray[np.int64]) -> RayShares:
+    def _shares(self, counts: IntArray, errors: IntArray) -> RayShares:
         total = int(counts[_RETURNS])
         occupied = total - counts[_FREE] - counts[_UNKNOWN]
         others = (counts[i] for i in (_PASSED, _PASSED_OBJECT, _MISSED))
@@ -244,7 +251,7 @@ class HeldOutScores:
         return RayShares(total, free, unknown, hit, passed, passed_object, missed, median, most)
 
 
-def swept_voxels(spec: GridSpec, grid_T_vehicles: Iterable[Transform]) -> NDArray[np.bool_]:
+def swept_voxels(spec: GridSpec, grid_T_vehicles: Iterable[Transform]) -> BoolArray:
     """Return (X, Y, Z) bool: the voxels whose centre lies in the space that the vehicle fills at
     any of some poses.
 
@@ -269,7 +276,7 @@ def swept_voxels(spec: GridSpec, grid_T_vehicles: Iterable[Transform]) -> NDArra
     return swept
 
 
-def lowest_of_columns(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def lowest_of_columns(occupied: BoolArray) -> BoolArray:
     """Return (X, Y, Z) bool: the lowest occupied voxel of each column, and the one above it."""
     lowest = occupied & (occupied.cumsum(axis=2) == 1)
     above = np.zeros_like(lowest)
@@ -277,7 +284,7 @@ def lowest_of_columns(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return lowest | above
 
 
-def _quantile(errors: NDArray[np.int64], share: float) -> float | None:
+def _quantile(errors: IntArray, share: float) -> float | None:
     """Return a quantile of a histogram of errors, in metres, to the width of its bins; 10 m stands
     for all larger ones.
     """
@@ -289,11 +296,11 @@ def _quantile(errors: NDArray[np.int64], share: float) -> float | None:
 
 
 def _follow(
-    solid: NDArray[np.uint8],
+    solid: Uint8Array,
     spec: GridSpec,
-    origins: NDArray[np.floating],
-    points: NDArray[np.floating],
-) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    origins: AnyFloatArray,
+    points: AnyFloatArray,
+) -> tuple[FloatArray, Uint8Array]:
     """Return what `follow_rays` returns, for (N, 3) rays that begin at (N, 3) origins, of which
     there are few different ones.
     """

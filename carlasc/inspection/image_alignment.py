@@ -10,11 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, Float32Array, FloatArray
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import invert, slerp, transform_points
 from carlasc.errors import CarlascError
@@ -129,9 +128,9 @@ class _View:
         moves: whether the vehicle moved in this time.
     """
 
-    edges: NDArray[np.float64]
-    contrast_of: NDArray[np.float32]
-    places: NDArray[np.float64]
+    edges: FloatArray
+    contrast_of: Float32Array
+    places: FloatArray
     moves: bool
 
     @classmethod
@@ -166,7 +165,7 @@ class _View:
             bool(apart[:, 3].max() > _MOVED_M or apart[:, :3].max() > _TURNED),
         )
 
-    def contrast(self, camera: CameraModel) -> NDArray[np.float64]:
+    def contrast(self, camera: CameraModel) -> FloatArray:
         """Return (T, S) the summed contrast of the image at the edges of depth, for each time and
         each shift.
         """
@@ -183,7 +182,7 @@ class _View:
         return contrast
 
 
-def _depth_edges(camera: CameraModel, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _depth_edges(camera: CameraModel, points: FloatArray) -> FloatArray:
     """Return (E, 3) points between neighbours in the image whose depths differ much, at the smaller
     depth, in the camera's frame.
     """
@@ -202,9 +201,7 @@ def _depth_edges(camera: CameraModel, points: NDArray[np.float64]) -> NDArray[np
     return looks * (near[edge] / looks[:, 2])[:, None]
 
 
-def _clearest(
-    values: NDArray[Any], thirds: list[NDArray[np.float64]], apart: float
-) -> float | None:
+def _clearest(values: AnyArray, thirds: list[FloatArray], apart: float) -> float | None:
     """Return the value at which a curve is highest; None if its thirds disagree, or if the maximum
     is not clear.
     """

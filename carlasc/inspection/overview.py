@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.captures.raw import Capture, find_captures
+from carlasc.core.arrays import IntArray
 from carlasc.core.notebook import data_frame
 from carlasc.errors import CarlascError, MissingDataError, without_credentials
 from carlasc.storage import as_source, layout
@@ -281,5 +281,5 @@ def _describe_capture(path: str, capture: Capture) -> CaptureOverview:
     )
 
 
-def _gaps(frames: NDArray[np.int64]) -> int:
+def _gaps(frames: IntArray) -> int:
     return int(np.count_nonzero(np.diff(frames) > 1))

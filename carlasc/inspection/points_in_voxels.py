@@ -7,8 +7,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyFloatArray, AnyIntArray, BoolArray, FloatArray, IntArray
 from carlasc.core.cells import Cells, find_voxel
 from carlasc.core.compiling import cached
 from carlasc.core.grids import GridSpec
@@ -19,15 +19,15 @@ _UNSHIFTED = np.zeros((1, 3), np.int64)
 
 
 def labels_at(
-    points: NDArray[np.floating],
+    points: AnyFloatArray,
     spec: GridSpec,
-    labels: NDArray[np.integer] | NDArray[np.bool_],
-    known: NDArray[np.bool_] | None = None,
+    labels: AnyIntArray | BoolArray,
+    known: BoolArray | None = None,
     *,
-    warps: NDArray[np.float64] | None = None,
+    warps: FloatArray | None = None,
     later_s: float = 0.0,
-    shifts: NDArray[np.int64] = _UNSHIFTED,
-) -> NDArray[np.int64]:
+    shifts: IntArray = _UNSHIFTED,
+) -> IntArray:
     """Return the labels of the voxels of points, under corrections of the points and of the grid.
 
     Args:

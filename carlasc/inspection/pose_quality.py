@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyFloatArray, FloatArray, IntArray
 from carlasc.core.geometry import check_rigid, invert, multiply, slerp
 from carlasc.errors import CarlascError, FormatError
 from carlasc.inspection.findings import Finding
@@ -59,9 +59,9 @@ class PoseQuality:
 
 
 def measure_poses(
-    points: Callable[[int], NDArray[np.floating]],
-    poses: NDArray[np.float64],
-    seconds: NDArray[np.float64] | None = None,
+    points: Callable[[int], AnyFloatArray],
+    poses: FloatArray,
+    seconds: FloatArray | None = None,
 ) -> PoseQuality:
     """Measure how well scans agree under their poses, and whether a lever arm or a delay explains
     the disagreement.
@@ -75,7 +75,7 @@ def measure_poses(
     times = np.asarray(
         layout.FRAME_PERIOD_S * np.arange(len(poses)) if seconds is None else seconds, np.float64
     )
-    before, after, runs = list[float](), list[float](), list[tuple[int, NDArray[np.float64]]]()
+    before, after, runs = list[float](), list[float](), list[tuple[int, FloatArray]]()
     numbers = np.arange(len(poses), dtype=np.float64)
     for first in _choose_runs(poses, times):
         rows = slice(first, first + _RUN)
@@ -143,7 +143,7 @@ def describe_mounting(mounting: Mounting, period_s: float) -> tuple[str, str] | 
     return (" and ".join(described), advice) if described else None
 
 
-def _choose_runs(poses: NDArray[np.float64], seconds: NDArray[np.float64]) -> list[int]:
+def _choose_runs(poses: FloatArray, seconds: FloatArray) -> list[int]:
     """Return the first rows of up to three runs that do not overlap: the sharpest turn, the largest
     acceleration, the middle.
     """
@@ -262,7 +262,7 @@ def _has_lines(sequence: Sequence, lines: int) -> bool:
     return True
 
 
-def _check_steps(sequence: Sequence, frames: NDArray[np.int64], where: str) -> Iterator[Finding]:
+def _check_steps(sequence: Sequence, frames: IntArray, where: str) -> Iterator[Finding]:
     """Check the first pose, and that the sensor moves and turns between frames as a vehicle can."""
     poses = np.stack([sequence.read_pose(frame) for frame in frames.tolist()])
     if frames[0] == 0 and np.abs(poses[0] - np.eye(4)).max() > _TOLERANCE:

@@ -9,8 +9,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import IntArray
 from carlasc.core.classes import ClassTable, Remap, class_weights
 from carlasc.core.notebook import data_frame
 from carlasc.core.tables import benchmark_remap, remap_named, remaps_between, to_table
@@ -46,8 +46,8 @@ class Histogram:
         moving_voxels: number of voxels that move, in grids with the field `actors`.
     """
 
-    points: NDArray[np.int64]
-    voxels: NDArray[np.int64]
+    points: IntArray
+    voxels: IntArray
     unknown: int = 0
     scans: int = 0
     grids: int = 0
@@ -64,7 +64,7 @@ class Histogram:
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         return Histogram(*(own + others for own, others in pairs))
 
-    def of(self, kind: Kind) -> NDArray[np.int64]:
+    def of(self, kind: Kind) -> IntArray:
         """Return the (K,) counts of points or of voxels."""
         return self.points if kind == "points" else self.voxels
 
@@ -113,7 +113,7 @@ class Statistics:
             sums[split] = sums.get(split, Histogram.empty(self.classes)) + histogram
         return sums
 
-    def summed(self, counts: NDArray[np.int64]) -> dict[str, int]:
+    def summed(self, counts: IntArray) -> dict[str, int]:
         """Return (C,) counts of the classes by the names of the remapped classes."""
         if self.remap is None:
             return self.named(counts)
@@ -122,7 +122,7 @@ class Statistics:
             summed[self.remap.target.names[new]] += int(counts[old]) if old < len(counts) else 0
         return summed
 
-    def named(self, counts: NDArray[np.int64]) -> dict[str, int]:
+    def named(self, counts: IntArray) -> dict[str, int]:
         """Return (C,) counts of the classes by their names."""
         return {name: int(counts[index]) for index, name in self.classes.names.items()}
 

@@ -8,11 +8,9 @@ points so near that they may be on the ego vehicle, are left out too.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, AnyFloatArray, BoolArray, FloatArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform
@@ -30,7 +28,7 @@ VOXEL_M = 0.4
 _CELLS = int(2 * MAX_RANGE_M / VOXEL_M)
 
 
-def static_structure(sequence: Sequence, frame: int) -> NDArray[np.float64]:
+def static_structure(sequence: Sequence, frame: int) -> FloatArray:
     """Read the structure of a scan.
 
     Args:
@@ -51,11 +49,11 @@ def static_structure(sequence: Sequence, frame: int) -> NDArray[np.float64]:
 
 
 def structure_of(
-    points: NDArray[np.floating],
-    labels: NDArray[Any] | None,
-    flow: NDArray[Any] | None,
+    points: AnyFloatArray,
+    labels: AnyArray | None,
+    flow: AnyArray | None,
     classes: ClassTable,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Return the structure of a scan.
 
     Args:
@@ -81,7 +79,7 @@ def structure_of(
 
 
 @cached(error_model="python")
-def within(points: NDArray[np.floating], nearest: float, farthest: float) -> NDArray[np.bool_]:
+def within(points: AnyFloatArray, nearest: float, farthest: float) -> BoolArray:
     """Return (N,) which of (N, 3) points are between two distances from the sensor.
 
     Points that are not finite are not.
@@ -93,7 +91,7 @@ def within(points: NDArray[np.floating], nearest: float, farthest: float) -> NDA
     return is_within
 
 
-def _per_point(sequence: Sequence, field: str, frame: int, count: int) -> NDArray[Any] | None:
+def _per_point(sequence: Sequence, field: str, frame: int, count: int) -> AnyArray | None:
     """Return a field of the points; None if it is missing or cannot be read (other checks report
     that).
     """
@@ -106,14 +104,14 @@ def _per_point(sequence: Sequence, field: str, frame: int, count: int) -> NDArra
     return array if len(array) == count else None
 
 
-def _rows(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _rows(mask: BoolArray) -> BoolArray:
     """Return which rows of an (N, 3) mask are all true: `mask.all(axis=1)` in a seventh of its
     time.
     """
     return mask[:, 0] & mask[:, 1] & mask[:, 2]
 
 
-def _static_classes(table: ClassTable) -> NDArray[np.bool_]:
+def _static_classes(table: ClassTable) -> BoolArray:
     """Return which ids are static objects above the ground.
 
     If no class contains only moving objects, all movable classes are left out.
@@ -123,7 +121,7 @@ def _static_classes(table: ClassTable) -> NDArray[np.bool_]:
     return static
 
 
-def _is_upright(points: NDArray[np.floating]) -> NDArray[np.bool_]:
+def _is_upright(points: AnyFloatArray) -> BoolArray:
     """Return (N,) which points are on upright objects, from the range of heights in columns of 0.4
     m.
     """
@@ -134,18 +132,18 @@ def _is_upright(points: NDArray[np.floating]) -> NDArray[np.bool_]:
     highest = np.full(width * width, -np.inf)
     np.minimum.at(lowest, column, points[:, 2])
     np.maximum.at(highest, column, points[:, 2])
-    upright: NDArray[np.bool_] = (highest - lowest)[column] > _UPRIGHT_M
+    upright: BoolArray = (highest - lowest)[column] > _UPRIGHT_M
     return upright & (points[:, 2] > lowest[column] + _FOOT_M)
 
 
-def occupancy(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def occupancy(points: FloatArray) -> BoolArray:
     """Return the (C, C, C) cells about the sensor that hold points, (N, 3) metres, sensor frame."""
     occupied = np.zeros((_CELLS, _CELLS, _CELLS), np.bool_)
     occupy(occupied, points, MAX_RANGE_M, VOXEL_M)
     return occupied
 
 
-def overlap(occupied: NDArray[np.bool_], motion: Transform, points: NDArray[np.float64]) -> float:
+def overlap(occupied: BoolArray, motion: Transform, points: FloatArray) -> float:
     """Return the share of the points of a scan that are in occupied cells of another.
 
     Args:
@@ -157,9 +155,7 @@ def overlap(occupied: NDArray[np.bool_], motion: Transform, points: NDArray[np.f
 
 
 @cached(error_model="python")
-def occupy(
-    occupied: NDArray[np.bool_], points: NDArray[np.float64], reach_m: float, voxel_m: float
-) -> None:
+def occupy(occupied: BoolArray, points: FloatArray, reach_m: float, voxel_m: float) -> None:
     """Mark the cells of a grid that hold points; the arguments are those of `count_occupied`."""
     cells = len(occupied)
     for i in range(len(points)):
@@ -171,9 +167,9 @@ def occupy(
 
 @cached(error_model="python")
 def count_occupied(
-    occupied: NDArray[np.bool_],
-    motion: NDArray[np.float64],
-    points: NDArray[np.float64],
+    occupied: BoolArray,
+    motion: FloatArray,
+    points: FloatArray,
     reach_m: float,
     voxel_m: float,
 ) -> int:

@@ -10,8 +10,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import Float32Array, FloatArray, LabelArray
 from carlasc.core.geometry import check_rigid
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, CarlascError
@@ -311,9 +311,7 @@ def _measure_grids(
         below.setdefault(name, GroundBelow(grid.spec)).add(ground)
 
 
-def _points(
-    sequence: Sequence, frame: int
-) -> tuple[NDArray[np.float32], NDArray[np.unsignedinteger] | None]:
+def _points(sequence: Sequence, frame: int) -> tuple[Float32Array, LabelArray | None]:
     """Read the points that a grid is made from: finite, and within the ranges given in
     carlasc.json.
     """
@@ -340,13 +338,13 @@ def _diagnose_poses(sequence: Sequence) -> PoseDiagnosis | None:
     except CarlascError:
         return None
 
-    def structure(index: int) -> NDArray[np.float64]:
+    def structure(index: int) -> FloatArray:
         try:
             return static_structure(sequence, frames[index])
         except CarlascError:
             return np.empty((0, 3))
 
-    def points(index: int) -> NDArray[np.float32]:
+    def points(index: int) -> Float32Array:
         try:
             return feed.static_points(frames[index])
         except CarlascError:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, AnyFloatArray, BoolArray, Float32Array, LabelArray
 from carlasc.core.classes import ClassTable
 from carlasc.errors import ArgumentError
 from carlasc.metrics.confusion import json_number, ratio
@@ -24,7 +24,7 @@ from carlasc.storage.field_files import dense_velocity
 
 SPEEDS_M_S = (0.0, 2.0, 5.0, 10.0)
 """Lower bounds of the speed bands in which velocities are scored, m/s."""
-Prepared = tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger], NDArray[np.bool_]]
+Prepared = tuple[LabelArray, LabelArray, BoolArray]
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class ActorScores:
             FormatError: a file does not fit its grid.
         """
         prediction, truth, counted = prepared
-        known, moving = dict[str, NDArray[Any]](), dict[str, NDArray[np.floating]]()
+        known, moving = dict[str, AnyArray](), dict[str, AnyFloatArray]()
         for name, side in (("prediction", pair.prediction), ("truth", pair.truth)):
             if isinstance(side, SequenceGrid):
                 known[name] = side.sequence.read(f"{side.grid}/instance", frame)
@@ -159,7 +159,7 @@ def movable_of(convention: Convention, table: ClassTable) -> frozenset[int]:
     )
 
 
-def _dense(side: SequenceGrid, frame: int, size: tuple[int, ...]) -> NDArray[np.float32]:
+def _dense(side: SequenceGrid, frame: int, size: tuple[int, ...]) -> Float32Array:
     """Return (V, 3) float32 velocities of voxels, m/s; zero where nothing moves or the grid has no
     velocities.
     """

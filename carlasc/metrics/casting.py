@@ -10,8 +10,9 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from carlasc.core.arrays import AnyFloatArray, FloatArray, IntArray, LabelArray, Uint8Array
 from carlasc.core.compiling import cached, jit
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
@@ -26,7 +27,7 @@ _STEPS = 10
 _HIGHEST_RAD = 0.21  # the last pitch is the first one at or above this angle
 
 
-def rayiou_directions() -> NDArray[np.float64]:
+def rayiou_directions() -> FloatArray:
     """Return the directions of the rays that RayIoU casts from each origin (SparseOcc's evaluation
     script).
 
@@ -47,13 +48,13 @@ def rayiou_directions() -> NDArray[np.float64]:
 
 
 def cast_rays(
-    grids: NDArray[np.unsignedinteger],
+    grids: LabelArray,
     spec: GridSpec,
-    origins: NDArray[np.floating],
-    directions: NDArray[np.floating],
+    origins: AnyFloatArray,
+    directions: AnyFloatArray,
     *,
     free: int = 0,
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+) -> tuple[IntArray, FloatArray]:
     """Cast rays through grids of the same geometry, and return the first occupied voxel on each
     ray.
 
@@ -109,11 +110,11 @@ def cast_rays(
 
 
 def follow_rays(
-    solid: NDArray[np.uint8],
+    solid: Uint8Array,
     spec: GridSpec,
-    origin: NDArray[np.floating],
-    points: NDArray[np.floating],
-) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    origin: AnyFloatArray,
+    points: AnyFloatArray,
+) -> tuple[FloatArray, Uint8Array]:
     """Trace measured rays through a grid: the first solid voxel on each ray, and the content of the
     voxels before the measured point.
 

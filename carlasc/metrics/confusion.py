@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, AnyIntArray, BoolArray, FloatArray, IntArray
 from carlasc.core.compiling import cached
 from carlasc.core.grids import Grid
 from carlasc.errors import ArgumentError, FormatError
@@ -22,7 +22,7 @@ from carlasc.errors import ArgumentError, FormatError
 if TYPE_CHECKING:
     import torch
 
-    Labels = NDArray[Any] | torch.Tensor
+    Labels = AnyArray | torch.Tensor
 else:
     Labels = Any
 
@@ -56,7 +56,7 @@ class ConfusionMatrix:
     """
 
     def __init__(
-        self, num_classes: int, *, free: int = 0, counts: NDArray[np.integer] | None = None
+        self, num_classes: int, *, free: int = 0, counts: AnyIntArray | None = None
     ) -> None:
         """Start with an empty matrix, or with `counts`.
 
@@ -78,7 +78,7 @@ class ConfusionMatrix:
             )
         self.num_classes = num_classes
         self.free = free
-        self.counts: NDArray[np.int64] = np.zeros((num_classes, num_classes), np.int64)
+        self.counts: IntArray = np.zeros((num_classes, num_classes), np.int64)
         if counts is not None:
             self.counts += counts
 
@@ -163,22 +163,22 @@ class ConfusionMatrix:
         return int(self.counts.sum())
 
     @property
-    def true_positives(self) -> NDArray[np.int64]:
+    def true_positives(self) -> IntArray:
         """(K,) number of correctly predicted voxels per class."""
         return np.diagonal(self.counts).copy()
 
     @property
-    def false_positives(self) -> NDArray[np.int64]:
+    def false_positives(self) -> IntArray:
         """(K,) number of voxels per predicted class that have another true class."""
         return self.counts.sum(axis=0) - np.diagonal(self.counts)
 
     @property
-    def false_negatives(self) -> NDArray[np.int64]:
+    def false_negatives(self) -> IntArray:
         """(K,) number of voxels per true class that are predicted as another class."""
         return self.counts.sum(axis=1) - np.diagonal(self.counts)
 
     @property
-    def iou(self) -> NDArray[np.float64]:
+    def iou(self) -> FloatArray:
         """(K,) intersection over union per class; NaN for classes that do not occur in the
         prediction or the ground truth.
         """
@@ -187,14 +187,14 @@ class ConfusionMatrix:
         )
 
     @property
-    def precision(self) -> NDArray[np.float64]:
+    def precision(self) -> FloatArray:
         """(K,) precision per class: share of the predicted voxels that are correct; NaN for classes
         that are never predicted.
         """
         return ratio(self.true_positives, self.counts.sum(axis=0))
 
     @property
-    def recall(self) -> NDArray[np.float64]:
+    def recall(self) -> FloatArray:
         """(K,) recall per class: share of the true voxels that are predicted correctly; NaN for
         classes without true voxels.
         """
@@ -253,7 +253,7 @@ def check_absent(absent: str) -> None:
         raise ArgumentError("absent", expected="zero or skip", found=repr(absent))
 
 
-def ratio(numerator: Any, denominator: Any) -> NDArray[np.float64]:
+def ratio(numerator: Any, denominator: Any) -> FloatArray:
     """Return the quotient; NaN where the denominator is zero."""
     numerator, denominator = np.asarray(numerator, np.float64), np.asarray(denominator, np.float64)
     return np.divide(
@@ -300,7 +300,7 @@ class TruthScore:
 
 
 def score_truth(
-    grid: Grid, reference: Grid, num_classes: int, mask: NDArray[np.bool_] | None = None
+    grid: Grid, reference: Grid, num_classes: int, mask: BoolArray | None = None
 ) -> TruthScore:
     """Score a ground truth grid against a reference, over the voxels that are known in both.
 
@@ -342,14 +342,14 @@ def device_of(*arrays: Any) -> Any:
     return tensors[0].device if tensors else None
 
 
-def to_numpy(array: Any) -> NDArray[Any]:
+def to_numpy(array: Any) -> AnyArray:
     """Convert a NumPy array, or a torch tensor on any device, to a NumPy array."""
     return np.asarray(array.detach().cpu() if hasattr(array, "detach") else array)
 
 
 def count_arrays(
-    prediction: NDArray[Any], truth: NDArray[Any], mask: NDArray[np.bool_] | None, num_classes: int
-) -> NDArray[np.int64]:
+    prediction: AnyArray, truth: AnyArray, mask: BoolArray | None, num_classes: int
+) -> IntArray:
     """Count pairs of classes on the CPU.
 
     Args:
@@ -384,7 +384,7 @@ def count_arrays(
 
 def count_tensors(
     device: torch.device, prediction: Labels, truth: Labels, mask: Labels | None, num_classes: int
-) -> NDArray[np.int64]:
+) -> IntArray:
     """Count on a torch device.
 
     Only the (K, K) result is copied back. Arguments, result and errors are those of `count_arrays`.
@@ -409,9 +409,7 @@ def count_tensors(
     return pairs.reshape(num_classes, num_classes).cpu().numpy()
 
 
-def _in_range(
-    labels: NDArray[Any], counted: NDArray[np.bool_], num_classes: int, name: str
-) -> NDArray[Any]:
+def _in_range(labels: AnyArray, counted: BoolArray, num_classes: int, name: str) -> AnyArray:
     """Return labels with all ids in 0..K-1.
 
     An id out of range is an error in counted voxels, and becomes 0 in other voxels.
@@ -428,8 +426,8 @@ def _in_range(
 
 @cached(error_model="python")
 def _count_pairs(
-    prediction: NDArray[Any], truth: NDArray[Any], counted: NDArray[np.bool_], num_classes: int
-) -> NDArray[np.int64]:
+    prediction: AnyArray, truth: AnyArray, counted: BoolArray, num_classes: int
+) -> IntArray:
     """Return `np.bincount(truth * K + prediction)` of the counted voxels, in one pass.
 
     Most voxels are free and predicted as free, so successive voxels increment the same element.
@@ -446,7 +444,7 @@ def _count_pairs(
     return tables
 
 
-def check_ids(name: str, ids: NDArray[Any], num_classes: int) -> None:
+def check_ids(name: str, ids: AnyArray, num_classes: int) -> None:
     """Raise FormatError if class ids, of any shape, are not all in 0..K-1."""
     if ids.size and (ids.min() < 0 or ids.max() >= num_classes):
         raise FormatError(

@@ -9,11 +9,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, BoolArray, LabelArray, Uint8Array
 from carlasc.core.benchmarks import (
     IGNORED,
     OCC3D,
@@ -114,11 +114,11 @@ class Convention:
 
     def prepare(
         self,
-        prediction: tuple[NDArray[Any], ClassTable],
-        truth: tuple[NDArray[Any], ClassTable],
-        known: NDArray[np.bool_] | None,
-        region: NDArray[np.bool_] | None = None,
-    ) -> tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger], NDArray[np.bool_]]:
+        prediction: tuple[AnyArray, ClassTable],
+        truth: tuple[AnyArray, ClassTable],
+        known: BoolArray | None,
+        region: BoolArray | None = None,
+    ) -> tuple[LabelArray, LabelArray, BoolArray]:
         """Convert the labels of a frame to the scored classes.
 
         Args:
@@ -154,10 +154,10 @@ class Convention:
 
     def count(
         self,
-        prediction: tuple[NDArray[Any], ClassTable],
-        truth: tuple[NDArray[Any], ClassTable],
-        known: NDArray[np.bool_] | None,
-        region: NDArray[np.bool_] | None = None,
+        prediction: tuple[AnyArray, ClassTable],
+        truth: tuple[AnyArray, ClassTable],
+        known: BoolArray | None,
+        region: BoolArray | None = None,
     ) -> ConfusionMatrix:
         """Return the confusion matrix of a frame in the scored classes.
 
@@ -201,7 +201,7 @@ class Convention:
             1 - occupied.recall,
         )
 
-    def _map(self, labels: NDArray[Any], table: ClassTable, where: str) -> NDArray[np.uint8]:
+    def _map(self, labels: AnyArray, table: ClassTable, where: str) -> Uint8Array:
         lookup = self._lookups[table.name]
         # the last entry is for all larger ids
         ids = lookup.take(labels.astype(np.uint32, copy=False), mode="clip")
@@ -217,7 +217,7 @@ class Convention:
         return ids
 
     @cached_property
-    def _lookups(self) -> dict[str, NDArray[np.uint8]]:
+    def _lookups(self) -> dict[str, Uint8Array]:
         lookups = {}
         for name, mapping in self.maps.items():
             # one more entry, for all larger ids

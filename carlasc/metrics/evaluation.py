@@ -10,8 +10,8 @@ from copy import copy
 from functools import cache, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import BoolArray, LabelArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import Grid, GridSpec
@@ -37,10 +37,10 @@ from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 
 _FrameBatch = tuple[Pair, list[int]]  # frames of one pair that a worker scores in one task
-_Known = Callable[[SeenBy], NDArray[np.bool_] | None]
+_Known = Callable[[SeenBy], BoolArray | None]
 # Labels of prediction and ground truth, and `known` of the ground truth, which is read once for all
 # conventions.
-LabelPair = tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger], _Known]
+LabelPair = tuple[LabelArray, LabelArray, _Known]
 _DISTANCES_M, _HEIGHTS = (0, 10, 20, 30), 4  # edges and number of the bands of `by`
 _TOGETHER = 8  # frames that a worker scores in one task
 
@@ -224,7 +224,7 @@ class Scorer:
 
     def _known(
         self, pair: Pair, frame: int, known_by: _Known, shape: tuple[int, ...]
-    ) -> NDArray[np.bool_] | None:
+    ) -> BoolArray | None:
         """Return the known voxels of the ground truth; None for all."""
         if self.scoring.voxels == "all":
             return None
@@ -243,8 +243,8 @@ class Scorer:
         pair: Pair,
         frame: int,
         spec: GridSpec,
-        truth: NDArray[np.unsignedinteger],
-        known: NDArray[np.bool_] | None,
+        truth: LabelArray,
+        known: BoolArray | None,
         table: ClassTable,
     ) -> Iterator[Masks]:
         """Yield the masks of each requested breakdown."""

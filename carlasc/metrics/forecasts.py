@@ -6,8 +6,8 @@ import re
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import BoolArray, IntArray, LabelArray
 from carlasc.core.choices import Around
 from carlasc.core.frames import Frames
 from carlasc.core.geometry import invert
@@ -70,15 +70,15 @@ class FutureGrid(GridFrames):
                 advice="for grids around the sensor pose of the later frame, use `around=future`",
             )
 
-    def frames(self) -> NDArray[np.int64]:
+    def frames(self) -> IntArray:
         """Return the sorted frames that have a later frame."""
         return np.array(sorted(self.later), np.int64)
 
-    def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
+    def labels(self, frame: int) -> LabelArray:
         """Return (X, Y, Z) the labels of the later frame."""
         return self._later(frame).labels
 
-    def known(self, frame: int, seen_by: SeenBy = "lidar") -> NDArray[np.bool_] | None:
+    def known(self, frame: int, seen_by: SeenBy = "lidar") -> BoolArray | None:
         """Return (X, Y, Z) bool, the known voxels of the later frame; None for cameras, because
         their mask cannot be moved.
         """

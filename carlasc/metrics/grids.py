@@ -12,11 +12,11 @@ from abc import ABC, abstractmethod
 from enum import IntEnum
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, BoolArray, IntArray, LabelArray, Uint8Array
 from carlasc.core.benchmarks import CARLAOCC
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, GridSpec
@@ -49,15 +49,15 @@ class GridFrames(ABC):
     benchmark: str | None = None
 
     @abstractmethod
-    def frames(self) -> NDArray[np.int64]:
+    def frames(self) -> IntArray:
         """Return the sorted frames that have labels."""
 
     @abstractmethod
-    def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
+    def labels(self, frame: int) -> LabelArray:
         """Return the labels of a frame: (X, Y, Z), or (X * Y * Z,) if the geometry is not known."""
 
     @abstractmethod
-    def known(self, frame: int, seen_by: SeenBy = "lidar") -> NDArray[np.bool_] | None:
+    def known(self, frame: int, seen_by: SeenBy = "lidar") -> BoolArray | None:
         """Return the known voxels of a frame (counts > 0, or not invalid), bool; None if the data
         do not have this information.
 
@@ -82,15 +82,15 @@ class SequenceGrid(GridFrames):
         self.path, self.location = sequence.path, f"{sequence.location}/{grid}"
         self.spec, self.classes = sequence.grids[grid], sequence.classes_of(grid)
 
-    def frames(self) -> NDArray[np.int64]:
+    def frames(self) -> IntArray:
         """Return the sorted frames that have labels."""
         return self.sequence.frames(f"{self.grid}/labels")
 
-    def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
+    def labels(self, frame: int) -> LabelArray:
         """Return (X, Y, Z) labels."""
         return self.sequence.read(f"{self.grid}/labels", frame)
 
-    def known(self, frame: int, seen_by: SeenBy = "lidar") -> NDArray[np.bool_] | None:
+    def known(self, frame: int, seen_by: SeenBy = "lidar") -> BoolArray | None:
         """Return (X, Y, Z) bool, the voxels with votes, or those that a camera also sees; None if
         the grid has no such fields.
         """
@@ -151,15 +151,15 @@ class LabelFolder(GridFrames):
             self.voxels = truth.voxels
 
     @cached_property
-    def _frames(self) -> NDArray[np.int64]:
+    def _frames(self) -> IntArray:
         numbers = [layout.frame_of(name, ".label") for name in os.listdir(self.folder)]
         return np.array(sorted(number for number in numbers if number is not None), np.int64)
 
-    def frames(self) -> NDArray[np.int64]:
+    def frames(self) -> IntArray:
         """Return the sorted frames that have a `.label` file."""
         return self._frames
 
-    def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
+    def labels(self, frame: int) -> LabelArray:
         """Return (X * Y * Z,) labels.
 
         Raises:
@@ -184,7 +184,7 @@ class LabelFolder(GridFrames):
         # with the size of the file, because devices have no size
         return np.fromfile(path, types[width], int(size // width))
 
-    def known(self, frame: int, seen_by: SeenBy = "lidar") -> NDArray[np.bool_] | None:
+    def known(self, frame: int, seen_by: SeenBy = "lidar") -> BoolArray | None:
         """Return (X * Y * Z,) bool, the voxels that have votes or are not invalid; None if no such
         file exists.
 
@@ -231,7 +231,7 @@ class VoxelOutcome(IntEnum):
     """Free in the ground truth, predicted occupied."""
 
 
-def compare_grids(prediction: Grid, truth: Grid) -> NDArray[np.uint8]:
+def compare_grids(prediction: Grid, truth: Grid) -> Uint8Array:
     """Compare a prediction with the ground truth, voxel by voxel.
 
     Args:
@@ -291,22 +291,22 @@ class CarlaOccGrids(GridFrames):
         }
         self.spec = read_geometry(self.files[min(self.files)]) if self.files else None
 
-    def frames(self) -> NDArray[np.int64]:
+    def frames(self) -> IntArray:
         """Return the sorted frames that have a file."""
         return np.array(sorted(self.files), np.int64)
 
-    def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
+    def labels(self, frame: int) -> LabelArray:
         """Return (X, Y, Z) tags."""
         return self._read(frame)[0]
 
-    def known(self, frame: int, seen_by: SeenBy = "lidar") -> NDArray[np.bool_]:
+    def known(self, frame: int, seen_by: SeenBy = "lidar") -> BoolArray:
         """Return (X, Y, Z) bool, the voxels that have a class or are free.
 
         Occupied voxels without a class are unknown.
         """
         return self._read(frame)[1]
 
-    def _read(self, frame: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    def _read(self, frame: int) -> tuple[Uint8Array, BoolArray]:
         file = self.files[frame]
         if (spec := read_geometry(file)) != self.spec:
             raise FormatError(
@@ -336,7 +336,7 @@ def sequence_name(folder: Path) -> str:
     return f"CARLAOCC_{folder.resolve().name.replace('_', '-')}"
 
 
-def read_voxels(path: str | Path, spec: GridSpec) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+def read_voxels(path: str | Path, spec: GridSpec) -> tuple[Uint8Array, BoolArray]:
     """Return (X, Y, Z) tags of a grid, and (X, Y, Z) bool, the known voxels.
 
     Occupied voxels without a class are unknown.
@@ -359,7 +359,7 @@ def read_voxels(path: str | Path, spec: GridSpec) -> tuple[NDArray[np.uint8], ND
     return labels, known
 
 
-def semantic_ids(codes: NDArray[np.unsignedinteger]) -> NDArray[np.uint8]:
+def semantic_ids(codes: LabelArray) -> Uint8Array:
     """Return the classes of voxel labels, which combine class and instance.
 
     The documentation has `1000 * class + instance`, the code that made the files `2048 * class +
@@ -402,7 +402,7 @@ def read_geometry(path: str | Path) -> GridSpec:
         ) from error
 
 
-def _read_arrays(path: str | Path, formats: dict[str, ArrayFormat]) -> list[NDArray[Any]]:
+def _read_arrays(path: str | Path, formats: dict[str, ArrayFormat]) -> list[AnyArray]:
     try:
         with open_npz(path) as arrays:
             return [arrays.read(name, expected) for name, expected in formats.items()]

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import BoolArray, IntArray, LabelArray
 from carlasc.core.benchmarks import OCC3D, OPENOCCUPANCY
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
@@ -56,7 +56,7 @@ class TokenFrames(GridFrames):
         if isinstance(truth, TokenFrames):
             self.tokens = truth.tokens
 
-    def frames(self) -> NDArray[np.int64]:
+    def frames(self) -> IntArray:
         """Return the numbers of the frames that have a file."""
         return np.array([i for i, token in enumerate(self.tokens) if token in self.files], np.int64)
 
@@ -73,7 +73,7 @@ class Occ3dScene(TokenFrames):
 
     spec, classes, benchmark = OCC3D_SPEC, OCC3D, "occ3d-lidar"
 
-    def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
+    def labels(self, frame: int) -> LabelArray:
         """Return (200, 200, 16) labels."""
         file = self._file(frame)
         with open_npz(file) as arrays:
@@ -85,7 +85,7 @@ class Occ3dScene(TokenFrames):
             raise FormatError(file, expected=f"class ids 0..{_NOISE}", found=found)
         return labels.astype(np.uint8, copy=False)
 
-    def known(self, frame: int, seen_by: SeenBy = "lidar") -> NDArray[np.bool_] | None:
+    def known(self, frame: int, seen_by: SeenBy = "lidar") -> BoolArray | None:
         """Return (200, 200, 16) bool, the voxels that the LiDAR or a camera observed; None if the
         file does not contain the mask.
         """
@@ -103,7 +103,7 @@ class OpenOccupancyScene(TokenFrames):
 
     spec, classes, benchmark = OPENOCCUPANCY_SPEC, OPENOCCUPANCY, "openoccupancy"
 
-    def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
+    def labels(self, frame: int) -> LabelArray:
         """Return (512, 512, 40) labels. The stored id 0, noise, becomes 255."""
         file = self._file(frame)
         rows = read_npy(file, ArrayFormat(NUMBERS, (None, None)))

@@ -6,11 +6,12 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from carlasc.core.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from carlasc.core.compiling import cached
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.metrics.confusion import check_ids, ratio, to_numpy
@@ -34,10 +35,10 @@ class PanopticScore:
         things: ids of classes with separate instances; the other classes are stuff.
     """
 
-    pq: NDArray[np.float64]
-    sq: NDArray[np.float64]
-    rq: NDArray[np.float64]
-    iou: NDArray[np.float64]
+    pq: FloatArray
+    sq: FloatArray
+    rq: FloatArray
+    iou: FloatArray
     things: frozenset[int]
 
     def mean(
@@ -78,11 +79,11 @@ class Segments:
             with equal classes.
     """
 
-    pred_class: NDArray[np.int64]
-    pred_size: NDArray[np.int64]
-    true_class: NDArray[np.int64]
-    true_size: NDArray[np.int64]
-    overlaps: NDArray[np.int64]
+    pred_class: IntArray
+    pred_size: IntArray
+    true_class: IntArray
+    true_size: IntArray
+    overlaps: IntArray
 
 
 class PanopticQuality(Summed):
@@ -218,11 +219,11 @@ class PanopticQuality(Summed):
 
 
 def match_segments(
-    prediction: tuple[NDArray[Any], NDArray[Any]],
-    truth: tuple[NDArray[Any], NDArray[Any]],
+    prediction: tuple[AnyArray, AnyArray],
+    truth: tuple[AnyArray, AnyArray],
     *,
     things: Collection[int] | None = None,
-    overlap: NDArray[np.bool_] | None = None,
+    overlap: BoolArray | None = None,
     free: int = 0,
 ) -> Segments:
     """Find the segments of prediction and ground truth, and the number of their common elements.

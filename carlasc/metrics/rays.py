@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from carlasc.core.arrays import AnyArray, AnyFloatArray, FloatArray, IntArray
 from carlasc.core.geometry import Transform, invert
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, FormatError
@@ -30,9 +31,7 @@ _MARGIN_M = 1.0
 _FEWEST_RAYS = 10  # segments with fewer rays are not counted as false negatives or false positives
 
 
-def ray_origins(
-    world_T_sensors: NDArray[np.float64], frame: int, spec: GridSpec
-) -> NDArray[np.float64]:
+def ray_origins(world_T_sensors: FloatArray, frame: int, spec: GridSpec) -> FloatArray:
     """Return the ray origins of a frame: sensor positions along the trajectory that are inside the
     grid of the frame.
 
@@ -66,7 +65,7 @@ class RayScore:
         free: id of free space, which is not scored.
     """
 
-    class_iou: NDArray[np.float64]
+    class_iou: FloatArray
     thresholds_m: tuple[float, ...]
     free: int
 
@@ -184,8 +183,8 @@ class RayIoU(Summed):
         return self
 
     def _cast(
-        self, grids: NDArray[Any], spec: GridSpec, origins: NDArray[np.floating], device: Any
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        self, grids: AnyArray, spec: GridSpec, origins: AnyFloatArray, device: Any
+    ) -> tuple[IntArray, FloatArray]:
         """Cast the rays on the device of the given tensors, or on the CPU in compiled code."""
         if device is None:
             return cast_rays(grids, spec, origins, self.directions, free=self.free)
@@ -202,7 +201,7 @@ class RayIoU(Summed):
         iou = ratio(self.hits, self.true + self.predicted - self.hits)
         return RayScore(iou, self.thresholds_m, self.free)
 
-    def _check(self, labels: ArrayLike, name: str, spec: GridSpec) -> NDArray[Any]:
+    def _check(self, labels: ArrayLike, name: str, spec: GridSpec) -> AnyArray:
         array = to_numpy(labels)
         if array.shape != spec.size:
             raise FormatError(name, expected=f"shape {spec.size}", found=str(array.shape))
@@ -312,6 +311,6 @@ class RayPQ:
         return self
 
 
-def _mean(values: NDArray[np.float64]) -> float:
+def _mean(values: FloatArray) -> float:
     present = values[~np.isnan(values)]
     return float(present.mean()) if present.size else float("nan")

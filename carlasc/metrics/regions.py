@@ -7,30 +7,29 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from carlasc.core.arrays import AnyArray, BoolArray
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.errors import ArgumentError
 from carlasc.metrics.casting import cast_rays
 from carlasc.metrics.confusion import ConfusionMatrix
 
-Masks = Mapping[str, NDArray[np.bool_]]
+Masks = Mapping[str, BoolArray]
 
 
-def known(counts: NDArray[Any]) -> NDArray[np.bool_]:
+def known(counts: AnyArray) -> BoolArray:
     """Return the voxels with votes (count > 0), bool with the shape of `counts`: the rule of the
     data set.
     """
     return counts > 0
 
 
-def distance_band(
-    spec: GridSpec, near_m: float = 0.0, far_m: float = math.inf
-) -> NDArray[np.bool_]:
+def distance_band(spec: GridSpec, near_m: float = 0.0, far_m: float = math.inf) -> BoolArray:
     """Return the voxels whose centre is at a horizontal distance of `near_m <= r < far_m` from the
     sensor.
 
@@ -60,7 +59,7 @@ def field_of_view(
     spec: GridSpec,
     horizontal_rad: float = 2 * math.pi,
     vertical_rad: tuple[float, float] = (-math.pi / 2, math.pi / 2),
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Return the voxels whose centre is in the field of view of a sensor at the origin.
 
     Args:

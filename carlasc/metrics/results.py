@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import IntArray
 from carlasc.core.classes import ClassTable
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics.actor_scores import ActorScore
@@ -410,7 +410,7 @@ def compare(
     like = first[common[0]]
     a, b = (np.stack([side[path].counts for path in common]) for side in (first, second))
 
-    def difference(one: NDArray[np.int64], other: NDArray[np.int64]) -> float:
+    def difference(one: IntArray, other: IntArray) -> float:
         return score(_matrix(one, like)) - score(_matrix(other, like))
 
     observed = difference(a.sum(axis=0), b.sum(axis=0))
@@ -442,7 +442,7 @@ def _checkjson_number(sequences: int) -> None:
         )
 
 
-def _matrix(counts: NDArray[np.int64], like: ConfusionMatrix) -> ConfusionMatrix:
+def _matrix(counts: IntArray, like: ConfusionMatrix) -> ConfusionMatrix:
     return ConfusionMatrix(like.num_classes, free=like.free, counts=counts)
 
 

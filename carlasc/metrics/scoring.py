@@ -6,14 +6,12 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
+from carlasc.core.arrays import BoolArray
 from carlasc.core.choices import Voxels as Voxels  # noqa: PLC0414 (part of this module)
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
 
-Region = Callable[[GridSpec], NDArray[np.bool_]]
+Region = Callable[[GridSpec], BoolArray]
 BREAKDOWNS = ("distance", "height", "visibility", "motion", "seen")
 
 

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from carlasc.core.arrays import BoolArray, IntArray
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import Grid
 from carlasc.errors import FormatError
@@ -115,7 +116,7 @@ class Consistency(Summed):
         self.matrix = ConfusionMatrix(self.matrix.num_classes, free=self.matrix.free)
 
 
-def shape_consistency(earlier: NDArray[np.bool_], later: NDArray[np.bool_]) -> float:
+def shape_consistency(earlier: BoolArray, later: BoolArray) -> float:
     """Return the IoU of the shapes of an actor in two frames, both in the reference frame of the
     actor.
 
@@ -265,6 +266,6 @@ class TrackingQuality(Summed):
         )
 
 
-def _counts(numbers: NDArray[np.int64]) -> list[tuple[int, int]]:
+def _counts(numbers: IntArray) -> list[tuple[int, int]]:
     values, sizes = np.unique(numbers, return_counts=True)
     return list(zip(values.tolist(), sizes.tolist(), strict=True))

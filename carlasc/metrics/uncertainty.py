@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.metrics.confusion import check_ids, to_numpy
 from carlasc.metrics.scoring import Summed
@@ -30,9 +31,9 @@ class Reliability:
         accuracy: (B,) share of correctly predicted voxels per bin.
     """
 
-    count: NDArray[np.int64]
-    confidence: NDArray[np.float64]
-    accuracy: NDArray[np.float64]
+    count: IntArray
+    confidence: FloatArray
+    accuracy: FloatArray
 
     @property
     def ece(self) -> float:
@@ -144,7 +145,7 @@ class Uncertainty(Summed):
                 np.ceil(confidence[chosen] * self.bins).astype(int) - 1, 0, self.bins - 1
             )
             weights = None, confidence[chosen], right[chosen]
-            sums: NDArray[np.float64] = np.stack(
+            sums: FloatArray = np.stack(
                 [np.bincount(bins, weight, self.bins) for weight in weights]
             )
             self.sums[row] += sums
@@ -163,7 +164,7 @@ class Uncertainty(Summed):
         )
 
 
-def _reliability(sums: NDArray[np.float64]) -> Reliability:
+def _reliability(sums: FloatArray) -> Reliability:
     count = sums[0]
     confidence, accuracy = np.divide(
         sums[1:], count, out=np.full((2, len(count)), np.nan), where=count > 0

@@ -11,9 +11,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from carlasc.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray, IntArray
+from carlasc.core.arrays import (
+    AnyFloatArray,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    Int32Array,
+    IntArray,
+)
 from carlasc.core.cells import fast_azimuth
 from carlasc.core.compiling import cached
 from carlasc.core.scans import finite
@@ -84,7 +90,7 @@ def ground_height(points: AnyFloatArray) -> float:
 @cached
 def _lowest(
     points: Float32Array,
-) -> tuple[NDArray[np.int32], NDArray[np.int32], IntArray]:
+) -> tuple[Int32Array, Int32Array, IntArray]:
     """Return the (N,) sector and the (N,) ring of each point, and the (S, R) index of the lowest
     point of each cell, -1 without one.
     """
@@ -160,8 +166,8 @@ def _support(planes: FloatArray, points: FloatArray, weight: FloatArray) -> Floa
 @cached
 def _ground(
     points: Float32Array,
-    sector: NDArray[np.int32],
-    ring: NDArray[np.int32],
+    sector: Int32Array,
+    ring: Int32Array,
     lowest: IntArray,
     plane: FloatArray,
 ) -> BoolArray:

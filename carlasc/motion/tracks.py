@@ -11,9 +11,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.core.arrays import (
+    AnyArray,
     AnyFloatArray,
     AnyIntArray,
     BoolArray,
@@ -422,7 +422,7 @@ def is_doubtful(confidence: float) -> bool:
     return confidence < _SURE
 
 
-def _tracks(arrays: Mapping[str, NDArray[Any]]) -> dict[int, Track]:
+def _tracks(arrays: Mapping[str, AnyArray]) -> dict[int, Track]:
     members: dict[int, dict[int, AnyIntArray]] = {}
     offset = 0
     for number, frame, count in arrays["frames"].tolist():

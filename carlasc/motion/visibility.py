@@ -13,9 +13,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from carlasc.core.arrays import Float32Array
+from carlasc.core.arrays import Float32Array, Int32Array, Uint32Array
 from carlasc.core.cells import Pose, fast_azimuth, transform
 from carlasc.core.compiling import cached, inlined
 
@@ -49,7 +48,7 @@ class SortedReturns(NamedTuple):
         origin: (C, 3) float32 origin of the rays of each column, metres, in the frame of the scan.
     """
 
-    start: NDArray[np.int32]
+    start: Int32Array
     slope: Float32Array
     distance: Float32Array
     origin: Float32Array
@@ -76,7 +75,7 @@ class SortedReturns(NamedTuple):
 @cached
 def _directions(
     points: Float32Array,
-) -> tuple[NDArray[np.int32], Float32Array, Float32Array]:
+) -> tuple[Int32Array, Float32Array, Float32Array]:
     """Return the column of each point, seen from (0, 0, 0), or -1 if it is too near; its slope; and
     its distance.
     """
@@ -101,8 +100,8 @@ def _directions(
 
 @cached
 def _by_column(
-    column: NDArray[np.int32], slope: Float32Array, began: Float32Array
-) -> tuple[NDArray[np.int32], NDArray[np.int32], Float32Array]:
+    column: Int32Array, slope: Float32Array, began: Float32Array
+) -> tuple[Int32Array, Int32Array, Float32Array]:
     """Return `start`, the indices of the points in the order of columns and slopes, and `origin`:
     see `SortedReturns`.
     """
@@ -152,12 +151,12 @@ def _column(azimuth: float) -> int:
 @cached
 def look_up(
     points: Float32Array,
-    asked: NDArray[np.int32],
+    asked: Int32Array,
     pose: Pose,
     view: SortedReturns,
     bit: int,
-    free: NDArray[np.uint32],
-    hit: NDArray[np.uint32],
+    free: Uint32Array,
+    hit: Uint32Array,
 ) -> None:
     """Set one bit of each point whose place another scan saw free or occupied.
 
@@ -207,12 +206,12 @@ def _count(bits: np.int64) -> np.int64:
 
 @cached
 def undecided(
-    asked: NDArray[np.int32],
-    free: NDArray[np.uint32],
-    hit: NDArray[np.uint32],
+    asked: Int32Array,
+    free: Uint32Array,
+    hit: Uint32Array,
     left: tuple[int, int],
     least: tuple[int, int],
-) -> NDArray[np.int32]:
+) -> Int32Array:
     """Return the points whose result the remaining scans may still change.
 
     Args:

@@ -11,9 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
+from carlasc.core.arrays import IntArray
 from carlasc.core.classes import ClassTable
 from carlasc.errors import ArgumentError
 from carlasc.groundtruth.reporting import digest_of_bytes
@@ -39,7 +37,7 @@ class PredictedSequence(DerivedSequence):
         whole: Sequence,
         target: ClassTable,
         by: str,
-        made: Mapping[str, NDArray[np.int64]],
+        made: Mapping[str, IntArray],
     ) -> None:
         """Wrap a sequence.
 

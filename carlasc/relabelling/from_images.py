@@ -15,11 +15,19 @@ from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import (
+    AnyArray,
+    AnyFloatArray,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+)
 from carlasc.core.cameras import CameraModel
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points
@@ -196,7 +204,7 @@ class PixelClasses:
             )
         return cls(sequence, files)
 
-    def read(self, camera: CameraModel, frame: int) -> NDArray[Any] | None:
+    def read(self, camera: CameraModel, frame: int) -> AnyArray | None:
         """Return (H, W) integers, class ids, or (H, W, C) floats, the probability of each id; None
         without classes of the image.
 
@@ -269,12 +277,12 @@ class _ClassImage(NamedTuple):
     camera: CameraModel
     world_T_camera: Transform
     seconds: float
-    ids: NDArray[Any]
+    ids: AnyArray
     sure: NDArray[np.float16] | None
-    nearest: NDArray[np.float64]
+    nearest: FloatArray
     cell_px: float
 
-    def hides(self, pixels: NDArray[np.float64], depths: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def hides(self, pixels: FloatArray, depths: FloatArray) -> BoolArray:
         """Return which points have nearer ones around them: in their cell, to the left and the
         right, or above and below.
         """
@@ -284,7 +292,7 @@ class _ClassImage(NamedTuple):
         across = np.square(depths) * self.cell_px / (self.camera.matrix[1, 1] * _HEIGHT_M)
         limit = depths * (1 - _NEARER) - _NEARER_M - across
 
-        def nearer(down: int, right: int) -> NDArray[np.bool_]:
+        def nearer(down: int, right: int) -> BoolArray:
             steps = range(1, _REACH_CELLS + 1)
             near = [padded[rows + step * down, columns + step * right] for step in steps]
             return np.asarray(np.min(near, axis=0) < limit)
@@ -292,9 +300,7 @@ class _ClassImage(NamedTuple):
         own = padded[rows, columns] < limit
         return np.asarray(own | (nearer(0, -1) & nearer(0, 1)) | (nearer(-1, 0) & nearer(1, 0)))
 
-    def votes(
-        self, pixels: NDArray[np.float64], classes: int
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def votes(self, pixels: FloatArray, classes: int) -> tuple[Float32Array, Float32Array]:
         """Return (N, C) votes for the classes of the pixels at and around (N, 2) positions, and
         (N, 1) weights: pixels that disagree with those around them have less.
         """
@@ -335,7 +341,7 @@ class _ShownSequence(PredictedSequence):
         self.plan, self.feed = replace(inputs.plan, voting=Voting()), inputs.feed
         self.actors, self.pixels, self.reader = inputs.actors, pixels, reader
 
-    def make(self, frame: int) -> dict[str, NDArray[Any]]:
+    def make(self, frame: int) -> dict[str, AnyArray]:
         """Return the classes of the points of a scan, and their field `probabilities`."""
         points = self.feed.sequence.scan(frame, ()).points
         shares = self._weigh(frame, points.astype(np.float64))
@@ -348,7 +354,7 @@ class _ShownSequence(PredictedSequence):
         pairs[shown] = self.reader.pairs(shares[shown], where)
         return {"labels": pairs[:, 0].astype(np.uint32), "probabilities": pairs}
 
-    def _weigh(self, frame: int, points: NDArray[np.float64]) -> NDArray[np.float32]:
+    def _weigh(self, frame: int, points: FloatArray) -> Float32Array:
         """Return the (N, C) weights of classes that images give to each point of a scan, by id in
         the table of the pixels.
         """
@@ -427,12 +433,12 @@ class _ShownSequence(PredictedSequence):
             yield _ClassImage(camera, pose @ place, late, ids, sure, nearest, cell)
 
 
-def _cells(pixels: NDArray[np.float64], cell_px: float) -> NDArray[np.int64]:
+def _cells(pixels: FloatArray, cell_px: float) -> IntArray:
     """Return (2, N) the column and the row of the cell of each pixel."""
     return ((pixels + 0.5) // cell_px).astype(np.int64).T
 
 
-def _fill_from_neighbours(shares: NDArray[np.float32], points: NDArray[np.floating]) -> None:
+def _fill_from_neighbours(shares: Float32Array, points: AnyFloatArray) -> None:
     """Give points that no image shows the shares of classes of other points in the same cell, the
     smallest cell with such points.
 

@@ -6,11 +6,10 @@ import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, BoolArray, Float32Array, FloatArray, Uint32Array
 from carlasc.core.frames import FrameRange
 from carlasc.core.geometry import invert, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
@@ -156,10 +155,10 @@ class _MovingSequence(DerivedSequence):
         super().__init__(whole, {layout.METADATA: metadata.to_json()}, made=made)
         self._feed, self.actors = feed, actors
 
-    def make(self, frame: int) -> dict[str, NDArray[Any]]:
+    def make(self, frame: int) -> dict[str, AnyArray]:
         """Return the new fields of a frame, and its labels if they change."""
         instances, flow = points_of_actors(self._feed, self.actors.between(frame, frame), frame)
-        fields: dict[str, NDArray[Any]] = {"instances": instances, "flow": flow}
+        fields: dict[str, AnyArray] = {"instances": instances, "flow": flow}
         if frame in self.made.get("labels", ()):
             labels = self.whole.read("labels", frame).astype(np.uint32)
             for moving, standing in self.whole.metadata.classes.standing.items():
@@ -170,7 +169,7 @@ class _MovingSequence(DerivedSequence):
 
 def points_of_actors(
     feed: ScanFeed, actors: MovingActors, frame: int
-) -> tuple[NDArray[np.uint32], NDArray[np.float32]]:
+) -> tuple[Uint32Array, Float32Array]:
     """Return the actor and the velocity of each point of a scan.
 
     Args:
@@ -218,7 +217,7 @@ def points_of_actors(
     return numbers, flow.astype(np.float32)
 
 
-def _inside(track: Track, frame: int, world: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _inside(track: Track, frame: int, world: FloatArray) -> BoolArray:
     """Return (N,) bool: which (N, 3) positions, metres, world, are in the body of a track."""
     pose = track.world_T_actor[frame - track.first]
     near = (

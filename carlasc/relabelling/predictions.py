@@ -11,11 +11,18 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import (
+    AnyArray,
+    AnyFloatArray,
+    AnyIntArray,
+    Float32Array,
+    Uint16Array,
+    Uint32Array,
+)
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.tables import TABLES, remaps_between, table_from_json, to_table
@@ -242,7 +249,7 @@ class PredictionReader:
             return cls(classes, classes, logits)
         return cls(classes, own, logits)
 
-    def read(self, path: Path, count: int) -> tuple[NDArray[np.uint32], NDArray[np.uint16] | None]:
+    def read(self, path: Path, count: int) -> tuple[Uint32Array, Uint16Array | None]:
         """Return the (N,) labels of the `count` points of a scan, and the (N, 6) field
         `probabilities`, or None if the file has none.
 
@@ -267,7 +274,7 @@ class PredictionReader:
         pairs = None if scores is None else self.pairs(scores, str(path))
         return converted.astype(np.uint32), pairs
 
-    def check(self, ids: NDArray[np.integer], where: str) -> None:
+    def check(self, ids: AnyIntArray, where: str) -> None:
         """Check that the class table of the files contains the ids.
 
         Raises:
@@ -280,7 +287,7 @@ class PredictionReader:
             advice = "give the class table of the predictions as `classes`"
             raise FormatError(where, expected=expected, found=str(unknown[0]), advice=advice)
 
-    def probabilities(self, scores: NDArray[np.floating], where: str) -> NDArray[np.float32]:
+    def probabilities(self, scores: AnyFloatArray, where: str) -> Float32Array:
         """Return (N, C) scores as float32 probabilities.
 
         Raises FormatError if they are not probabilities.
@@ -303,7 +310,7 @@ class PredictionReader:
             raise FormatError(where, expected=expected, found=found, advice=advice)
         return shares
 
-    def pairs(self, shares: NDArray[np.float32], where: str) -> NDArray[np.uint16]:
+    def pairs(self, shares: Float32Array, where: str) -> Uint16Array:
         """Return the most probable classes of each point of (N, C) probabilities, with their
         probabilities. Merged classes are added up.
         """
@@ -326,7 +333,7 @@ class PredictionReader:
         return pairs
 
 
-def load(path: Path) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
+def load(path: Path) -> tuple[AnyArray | None, AnyArray | None]:
     """Return the labels, (N,) integers, and the scores, (N, C) floats, of a file; None for what it
     does not contain.
     """
@@ -376,7 +383,7 @@ class _LabelledSequence(PredictedSequence):
         )
         self.files, self.reader = files, reader
 
-    def make(self, frame: int) -> dict[str, NDArray[Any]]:
+    def make(self, frame: int) -> dict[str, AnyArray]:
         """Return the labels of a frame, and the probabilities if the files have them."""
         path = self.files.path(frame)
         labels, pairs = self.reader.read(path, len(self.whole.read("points", frame)))

@@ -9,8 +9,8 @@ import time
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.geometry import invert, multiply
 from carlasc.errors import ArgumentError
 from carlasc.groundtruth.from_scans.feed import ScanFeed
@@ -214,7 +214,7 @@ def _mounting(feed: ScanFeed, change: RefinedPoses) -> Mounting | None:
     return find_mounting(change.given, np.array(list(feed.times.values())), runs)
 
 
-def _poses(posed: Sequence, change: RefinedPoses) -> NDArray[np.float64]:
+def _poses(posed: Sequence, change: RefinedPoses) -> FloatArray:
     """Return the lines of poses.txt.
 
     The pose of the first scan stays: it is the origin of the others.
@@ -228,7 +228,7 @@ def _poses(posed: Sequence, change: RefinedPoses) -> NDArray[np.float64]:
     return poses
 
 
-def _notes(change: RefinedPoses, frames: NDArray[np.int64]) -> list[str]:
+def _notes(change: RefinedPoses, frames: IntArray) -> list[str]:
     """Return the first note on the result of a refinement, or one on poses that did not change."""
     if notes := list(pose_notes(change, frames)):
         return notes[:1]

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray
 from carlasc.errors import FormatError, MissingDataError, reading
 
 _LONGEST_HEADER = 1 << 14  # bytes; NumPy refuses headers of more than 10,000
@@ -70,7 +70,7 @@ class ArrayFormat:
         return all(kind in tuple(map(np.dtype, self.dtypes)) for kind in kinds)
 
 
-def parse_npy(data: bytes | memoryview, expected: ArrayFormat, where: str) -> NDArray[Any]:
+def parse_npy(data: bytes | memoryview, expected: ArrayFormat, where: str) -> AnyArray:
     """Return the array of a .npy file.
 
     Args:
@@ -91,7 +91,7 @@ def parse_npy(data: bytes | memoryview, expected: ArrayFormat, where: str) -> ND
     return np.asarray(values.reshape(shape, order="F" if fortran_order else "C"), order="C")
 
 
-def read_npy(path: str | Path, expected: ArrayFormat) -> NDArray[Any]:
+def read_npy(path: str | Path, expected: ArrayFormat) -> AnyArray:
     """Return the array of a .npy file on this machine.
 
     A file that is longer than its header says is not read.
@@ -164,7 +164,7 @@ class NpzFile:
         ):
             return _npy_header(stream)[2]
 
-    def read(self, name: str, expected: ArrayFormat) -> NDArray[Any]:
+    def read(self, name: str, expected: ArrayFormat) -> AnyArray:
         """Return an array, in C order.
 
         Raises:
@@ -189,7 +189,7 @@ class NpzFile:
             return _read_array(stream, member.file_size, expected, where, member.compress_size)
 
 
-def npz_bytes(arrays: Mapping[str, tuple[NDArray[Any], int]]) -> bytes:
+def npz_bytes(arrays: Mapping[str, tuple[AnyArray, int]]) -> bytes:
     """Return a compressed .npz file like that of `numpy.savez_compressed`, but with one Deflate
     level per array.
 
@@ -260,7 +260,7 @@ def _npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]
 
 def _read_array(
     stream: IO[bytes], length: int, expected: ArrayFormat, where: str, packed: int | None = None
-) -> NDArray[Any]:
+) -> AnyArray:
     """Return the array of a .npy file of `length` bytes, which are `packed` bytes in a zip."""
     shape, *_ = _check_header(stream, length, expected, where)
     if packed is not None:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, LabelArray, Uint8Array
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import Transform, invert, slerp
 from carlasc.errors import FormatError, MissingDataError, import_extra
@@ -158,7 +158,7 @@ def has_image(sequence: Sequence, camera: CameraModel, frame: int) -> bool:
 
 def read_image(
     sequence: Sequence, camera: CameraModel, frame: int, folder: str = "images"
-) -> NDArray[Any]:
+) -> AnyArray:
     """Return the image of a frame: (H, W, 3) uint8 RGB, or (H, W) integers: classes, instances or
     depths.
 
@@ -208,7 +208,7 @@ def image_bytes(
     )
 
 
-def decode_image(data: bytes, where: str, camera: CameraModel, *, color: bool) -> NDArray[Any]:
+def decode_image(data: bytes, where: str, camera: CameraModel, *, color: bool) -> AnyArray:
     """Return the pixels of a JPEG or PNG file of a camera, as `read_image` does.
 
     With `color`, they are (H, W, 3) RGB, otherwise (H, W).
@@ -240,9 +240,7 @@ def decode_image(data: bytes, where: str, camera: CameraModel, *, color: bool) -
     return pixels
 
 
-def encode_image(
-    pixels: NDArray[np.unsignedinteger], kind: str, quality: int = 90
-) -> NDArray[np.uint8]:
+def encode_image(pixels: LabelArray, kind: str, quality: int = 90) -> Uint8Array:
     """Return an image as the bytes of a file: "JPEG" of (H, W, 3) uint8, or "PNG" of (H, W, 3)
     uint8 or (H, W) uint8 or uint16.
 

@@ -12,11 +12,10 @@ from collections.abc import Sequence as Series
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath, PurePosixPath
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray
 from carlasc.errors import ConflictError
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
@@ -104,7 +103,7 @@ def copy_blocks(blocks: Series[FrameBlock], run: Run, *, again: bool = False) ->
 
 
 def _copy(block: FrameBlock) -> int:
-    found: dict[int, dict[str, NDArray[Any]]] = {}
+    found: dict[int, dict[str, AnyArray]] = {}
     for name, frames in block.frames.items():
         for frame, array in zip(frames, block.sequence.read_many(name, frames), strict=True):
             found.setdefault(frame, {})[name] = array

@@ -19,8 +19,8 @@ from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, IntArray
 from carlasc.errors import ConflictError, MissingDataError
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
@@ -68,7 +68,7 @@ class DerivedSequence(SequenceView):
         whole: Sequence,
         texts: Mapping[str, bytes],
         *,
-        made: Mapping[str, NDArray[np.int64]] = MappingProxyType({}),
+        made: Mapping[str, IntArray] = MappingProxyType({}),
         stale: Collection[str] = (),
     ) -> None:
         """Wrap a sequence.
@@ -82,14 +82,14 @@ class DerivedSequence(SequenceView):
         super().__init__(whole)
         self.texts, self.made = dict(texts), dict(made)
         self.kept = frozenset(name for name in whole.fields() - {*made, *stale} if "/" not in name)
-        self._unread: dict[int, dict[str, NDArray[Any]]] = {}
+        self._unread: dict[int, dict[str, AnyArray]] = {}
         self.left_out = {*stale} & whole.fields() | {f"{grid}/" for grid in whole.grids}
 
     def fields(self) -> frozenset[str]:
         """Return the unchanged fields and the replaced or new ones."""
         return self.kept | self.made.keys()
 
-    def frames(self, field: str) -> NDArray[np.int64]:
+    def frames(self, field: str) -> IntArray:
         """Return the frames of a field."""
         return (
             self.whole.frames(field)
@@ -97,11 +97,11 @@ class DerivedSequence(SequenceView):
             else self.made.get(field, np.empty(0, np.int64))
         )
 
-    def make(self, frame: int) -> dict[str, NDArray[Any]]:
+    def make(self, frame: int) -> dict[str, AnyArray]:
         """Return the replaced or new fields of a frame."""
         return {}
 
-    def read(self, field: str, frame: int) -> NDArray[Any]:
+    def read(self, field: str, frame: int) -> AnyArray:
         """Read one field of one frame.
 
         All made fields of a frame are kept in memory until the last of them, by name, is read.

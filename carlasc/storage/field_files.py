@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, Float32Array
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError
 from carlasc.storage.arrays import ArrayFormat, npz_bytes, open_npz
@@ -86,7 +86,7 @@ class Field:
 
     def decode(
         self, data: bytes | memoryview, where: str, shape: tuple[int, ...] | None = None
-    ) -> NDArray[Any]:
+    ) -> AnyArray:
         """Return the content of a file as an array, without a copy if the type allows it.
 
         Args:
@@ -136,7 +136,7 @@ class Field:
             else np.dtype(self.dtype).itemsize * math.prod(shape)
         )
 
-    def encode(self, array: NDArray[Any], where: str) -> bytes | memoryview:
+    def encode(self, array: AnyArray, where: str) -> bytes | memoryview:
         """Return the bytes of a frame's file.
 
         Raises:
@@ -151,7 +151,7 @@ class Field:
             return array.tobytes()
         return np.ascontiguousarray(array, np.dtype(self.dtype)).reshape(-1).view(np.uint8).data
 
-    def check(self, array: NDArray[Any], where: str) -> None:
+    def check(self, array: AnyArray, where: str) -> None:
         """Check that an array has the shape and the type of a frame of the field.
 
         Raises:
@@ -185,9 +185,7 @@ class Field:
             )
 
 
-def _decode_votes(
-    data: bytes | memoryview, where: str, shape: tuple[int, ...] | None
-) -> NDArray[Any]:
+def _decode_votes(data: bytes | memoryview, where: str, shape: tuple[int, ...] | None) -> AnyArray:
     # The largest possible table: one row per voxel and class.
     most = None if shape is None else _MOST_CLASSES * math.prod(shape)
     with open_npz(data, where) as archive:
@@ -201,7 +199,7 @@ def _decode_votes(
 
 def _decode_velocities(
     data: bytes | memoryview, where: str, shape: tuple[int, ...] | None
-) -> NDArray[Any]:
+) -> AnyArray:
     with open_npz(data, where) as archive:
         voxels = archive.read(
             "voxel", ArrayFormat(("<i4",), (None,), None if shape is None else math.prod(shape))
@@ -214,7 +212,7 @@ def _decode_velocities(
     return table
 
 
-def check_velocity(velocity: NDArray[Any], count: int, where: str) -> None:
+def check_velocity(velocity: AnyArray, count: int, where: str) -> None:
     """Check a field `<grid>/velocity`, (M,) rows of voxel and velocity, of a grid of `count`
     voxels.
 
@@ -229,9 +227,7 @@ def check_velocity(velocity: NDArray[Any], count: int, where: str) -> None:
         raise FormatError(where, expected="finite velocities", found="NaN or infinity")
 
 
-def dense_velocity(
-    velocity: NDArray[Any], size: tuple[int, ...], where: str
-) -> NDArray[np.float32]:
+def dense_velocity(velocity: AnyArray, size: tuple[int, ...], where: str) -> Float32Array:
     """Return (X, Y, Z, 3) float32 m/s of a grid of shape `size`; zero where nothing moves.
 
     Checks `velocity` with `check_velocity`.
@@ -242,7 +238,7 @@ def dense_velocity(
     return dense
 
 
-def _decode_boxes(data: bytes | memoryview, where: str) -> NDArray[Any]:
+def _decode_boxes(data: bytes | memoryview, where: str) -> AnyArray:
     if len(data) % BOXES_DTYPE.itemsize:
         raise FormatError(
             where,
@@ -253,5 +249,5 @@ def _decode_boxes(data: bytes | memoryview, where: str) -> NDArray[Any]:
     return np.frombuffer(data, BOXES_DTYPE)
 
 
-def _encode_votes(votes: NDArray[Any]) -> bytes:
+def _encode_votes(votes: AnyArray) -> bytes:
     return npz_bytes({name: (votes[name], level) for name, level in _VOTES_LEVELS.items()})

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import field_files, layout
@@ -140,11 +140,11 @@ class FolderWriter(SequenceWriter):
         """Forget the listings of folders in an object store."""
         self.target.tree.refresh()
 
-    def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
+    def write(self, field: str, frame: int, array: AnyArray) -> None:
         """Write one file."""
         self.target.put(*self._file(field, frame, array))
 
-    def write_frames(self, frames: Mapping[int, Mapping[str, NDArray[Any]]]) -> None:
+    def write_frames(self, frames: Mapping[int, Mapping[str, AnyArray]]) -> None:
         """Write the files of several frames in parallel.
 
         The last file of each frame is written after the other files of that frame.
@@ -158,12 +158,12 @@ class FolderWriter(SequenceWriter):
             dict(parts[-1] for parts in files if parts),
         )
 
-    def _file(self, field: str, frame: int, array: NDArray[Any]) -> tuple[str, bytes | memoryview]:
+    def _file(self, field: str, frame: int, array: AnyArray) -> tuple[str, bytes | memoryview]:
         entry = layout.field_named(field)
         path = entry.file(frame)
         return path, entry.encode(array, self.target.tree.where(path))
 
-    def read(self, field: str, frame: int) -> NDArray[Any]:
+    def read(self, field: str, frame: int) -> AnyArray:
         """Return the array of a file that exists."""
         entry = layout.field_named(field)
         path = entry.file(frame)

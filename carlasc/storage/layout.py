@@ -16,8 +16,8 @@ from pathlib import PurePosixPath
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.core.choices import Coordinates
 from carlasc.core.grids import GridSpec
@@ -286,14 +286,14 @@ def frame_of(file_name: str, suffix: str) -> int | None:
     return int(stem) if 6 <= len(stem) <= 18 and stem.isascii() and stem.isdigit() else None
 
 
-def encode_poses(poses: NDArray[np.float64]) -> bytes:
+def encode_poses(poses: FloatArray) -> bytes:
     """Return the text of poses.txt for (F, 4, 4) transforms: the first three rows of each,
     row-major, '%.18e'.
     """
     return _encode_lines(poses[:, :3, :].reshape(-1, 12))
 
 
-def decode_poses(data: bytes, where: str) -> NDArray[np.float64]:
+def decode_poses(data: bytes, where: str) -> FloatArray:
     """Read poses.txt as (F, 4, 4) float64.
 
     Raises:
@@ -305,12 +305,12 @@ def decode_poses(data: bytes, where: str) -> NDArray[np.float64]:
     return poses
 
 
-def encode_times(times: NDArray[np.float64]) -> bytes:
+def encode_times(times: FloatArray) -> bytes:
     """Return the text of times.txt for (F,) seconds: one number per line, '%.18e'."""
     return _encode_lines(np.asarray(times, np.float64).reshape(-1, 1))
 
 
-def decode_times(data: bytes, where: str) -> NDArray[np.float64]:
+def decode_times(data: bytes, where: str) -> FloatArray:
     """Read times.txt as (F,) float64 seconds.
 
     Raises:
@@ -319,13 +319,13 @@ def decode_times(data: bytes, where: str) -> NDArray[np.float64]:
     return _decode_lines(data, 1, where)[:, 0]
 
 
-def _encode_lines(rows: NDArray[np.float64]) -> bytes:
+def _encode_lines(rows: FloatArray) -> bytes:
     return "".join(
         " ".join(f"{value:.18e}" for value in row) + "\n" for row in rows.tolist()
     ).encode()
 
 
-def _decode_lines(data: bytes, columns: int, where: str) -> NDArray[np.float64]:
+def _decode_lines(data: bytes, columns: int, where: str) -> FloatArray:
     try:
         rows = [
             list(map(float, line.split())) for line in data.decode().splitlines() if line.strip()

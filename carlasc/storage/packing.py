@@ -10,11 +10,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray
 from carlasc.errors import ArgumentError, ConflictError, StorageError
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
@@ -248,11 +248,11 @@ def _append_sequence(
 
 def _read_ahead(
     sequence: Sequence, name: str, frames: list[int], threads: int
-) -> Iterator[tuple[int, NDArray[Any]]]:
+) -> Iterator[tuple[int, AnyArray]]:
     """Yield the frames of a field in order. Threads read the next blocks in advance."""
     blocks = [frames[first : first + _BLOCK] for first in range(0, len(frames), _BLOCK)]
     with ThreadPoolExecutor(threads) as pool:
-        ahead: deque[Future[list[NDArray[Any]]]] = deque()
+        ahead: deque[Future[list[AnyArray]]] = deque()
         for number, block in enumerate(blocks):
             while len(ahead) < threads and number + len(ahead) < len(blocks):
                 ahead.append(pool.submit(sequence.read_many, name, blocks[number + len(ahead)]))

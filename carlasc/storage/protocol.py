@@ -17,8 +17,8 @@ from functools import cached_property
 from typing import Any, Protocol, Self, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, IntArray, LabelArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import check_seconds
@@ -74,7 +74,7 @@ class Sequence(ABC):
     name: str
     coordinates: Coordinates
     tree: FileTree | None = None
-    _given_poses: NDArray[np.float64] | None = None
+    _given_poses: FloatArray | None = None
 
     @abstractmethod
     def fields(self) -> frozenset[str]:
@@ -83,13 +83,13 @@ class Sequence(ABC):
         """
 
     @abstractmethod
-    def frames(self, field: str) -> NDArray[np.int64]:
+    def frames(self, field: str) -> IntArray:
         """Return the sorted numbers of the (N,) frames that have a field; empty if the sequence
         does not have the field.
         """
 
     @abstractmethod
-    def read(self, field: str, frame: int) -> NDArray[Any]:
+    def read(self, field: str, frame: int) -> AnyArray:
         """Read one field of one frame, with the values and the shape of the published file.
 
         Labels and counts may have a narrower type than in the file. `points` is (N, 4) float32, the
@@ -115,7 +115,7 @@ class Sequence(ABC):
             MissingDataError: the file does not exist.
         """
 
-    def read_many(self, field: str, frames: Iterable[int]) -> list[NDArray[Any]]:
+    def read_many(self, field: str, frames: Iterable[int]) -> list[AnyArray]:
         """Read one field of several frames, each with the shape that `read` returns.
 
         Some stores read them together, which is faster.
@@ -123,8 +123,8 @@ class Sequence(ABC):
         return [self.read(field, frame) for frame in frames]
 
     def read_xyz(
-        self, frames: Iterable[int], spare: list[NDArray[np.float32]] | None = None
-    ) -> list[NDArray[np.float32]]:
+        self, frames: Iterable[int], spare: list[Float32Array] | None = None
+    ) -> list[Float32Array]:
         """Read the coordinates of the points of several frames, in the memory layout of the store.
 
         The caller must not keep the arrays.
@@ -218,7 +218,7 @@ class Sequence(ABC):
         )
         return record
 
-    def with_poses(self, poses: NDArray[np.float64]) -> Self:
+    def with_poses(self, poses: FloatArray) -> Self:
         """Return a copy of the sequence with other poses than those in its poses.txt.
 
         Copies and pickles of the result keep these poses. Its documents are those of the sequence.
@@ -232,7 +232,7 @@ class Sequence(ABC):
         return other
 
     @cached_property
-    def poses(self) -> NDArray[np.float64]:
+    def poses(self) -> FloatArray:
         """(F, 4, 4) first_T_sensor, one per line of poses.txt; `read_pose` returns that of a frame.
 
         Raises:
@@ -245,7 +245,7 @@ class Sequence(ABC):
         )
 
     @cached_property
-    def times(self) -> NDArray[np.float64]:
+    def times(self) -> FloatArray:
         """(F,) seconds since the first frame, one per line of times.txt; `read_time` returns that
         of a frame.
         """
@@ -284,7 +284,7 @@ class Sequence(ABC):
             )[0]
         )
 
-    def times_of(self, frames: Iterable[int]) -> NDArray[np.float64]:
+    def times_of(self, frames: Iterable[int]) -> FloatArray:
         """Return (F,) seconds of frames since the first frame: those of `read_time`, or at 10 Hz
         without times.txt.
         """
@@ -327,7 +327,7 @@ class Sequence(ABC):
             int(frame): line for line, frame in enumerate(frames)
         }
 
-    def scan_frames(self) -> NDArray[np.int64]:
+    def scan_frames(self) -> IntArray:
         """Return the (N,) frames of the sequence: frames with points, or frames of any field if the
         sequence has no scans.
         """
@@ -378,7 +378,7 @@ class Sequence(ABC):
                 found=f"{', '.join(self.grids) or 'none'}",
             )
         counts = self.read(f"{name}/counts", frame) if f"{name}/counts" in self.fields() else None
-        labels = cast(NDArray[np.unsignedinteger], self.read(f"{name}/labels", frame))
+        labels = cast(LabelArray, self.read(f"{name}/labels", frame))
         try:
             return Grid(self.grids[name], labels, counts)
         except FormatError as error:

@@ -9,8 +9,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, IntArray
 from carlasc.core.frames import compact, expand
 from carlasc.errors import MissingDataError
 from carlasc.storage import field_files, layout
@@ -101,14 +101,14 @@ class PublishedSequence(Sequence):
         return fields
 
     @cached_property
-    def _frames(self) -> dict[str, NDArray[np.int64]]:
+    def _frames(self) -> dict[str, IntArray]:
         return {}
 
     def fields(self) -> frozenset[str]:
         """Return the fields with at least one frame."""
         return frozenset(name for name in self._listing if len(self.frames(name)))
 
-    def frames(self, field: str) -> NDArray[np.int64]:
+    def frames(self, field: str) -> IntArray:
         """Return the frames of a field. Its folder is listed once."""
         if field not in self._frames:
             self._list_folder_of(field)
@@ -139,7 +139,7 @@ class PublishedSequence(Sequence):
             ]
             self._frames[sibling.name] = np.array(sorted(numbers), np.int64)
 
-    def read(self, field: str, frame: int) -> NDArray[Any]:
+    def read(self, field: str, frame: int) -> AnyArray:
         """Read one file.
 
         A local file is memory-mapped: the array is read-only, and its bytes are read on access.
@@ -151,7 +151,7 @@ class PublishedSequence(Sequence):
             self.tree.read(path, entry.size_of(shape)), self.tree.where(path), shape
         )
 
-    def read_many(self, field: str, frames: Iterable[int]) -> list[NDArray[Any]]:
+    def read_many(self, field: str, frames: Iterable[int]) -> list[AnyArray]:
         """Read several files; all at once from a remote tree."""
         entry = self._entry(field)
         paths = [self._prefix + entry.file(frame) for frame in frames]

@@ -15,8 +15,8 @@ from hashlib import sha256
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, FloatArray, IntArray
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json, to_json
@@ -151,7 +151,7 @@ def _first_difference(existing: dict[str, Any], wanted: dict[str, Any]) -> str |
     return None
 
 
-def agree_poses(writer: SequenceWriter, poses: NDArray[np.float64]) -> bytes | None:
+def agree_poses(writer: SequenceWriter, poses: FloatArray) -> bytes | None:
     """Return the poses.txt to write; None if the existing one is complete.
 
     Existing poses must be equal to those of this run. Lines without a pose (NaN: it could not be
@@ -168,7 +168,7 @@ def agree_poses(writer: SequenceWriter, poses: NDArray[np.float64]) -> bytes | N
     return None if merged is None else layout.encode_poses(merged)
 
 
-def agree_times(writer: SequenceWriter, times: NDArray[np.float64]) -> bytes | None:
+def agree_times(writer: SequenceWriter, times: FloatArray) -> bytes | None:
     """Return the times.txt to write; None if the existing one is complete.
 
     Raises:
@@ -182,9 +182,7 @@ def agree_times(writer: SequenceWriter, times: NDArray[np.float64]) -> bytes | N
     return None if merged is None else layout.encode_times(merged)
 
 
-def _merge(
-    existing: NDArray[np.float64], ours: NDArray[np.float64], where: str
-) -> NDArray[np.float64] | None:
+def _merge(existing: FloatArray, ours: FloatArray, where: str) -> FloatArray | None:
     """Return the existing rows, completed by our rows; None if no row was missing."""
     both = min(len(existing), len(ours))
     differs = np.abs(existing[:both] - ours[:both]) > _TOLERANCE  # False if either is NaN
@@ -218,7 +216,7 @@ def agree_metadata(writer: SequenceWriter, metadata: Metadata) -> bytes | None:
     return metadata.to_json() if data is None and metadata != Metadata() else None
 
 
-def check_scan(writer: SequenceWriter, field: str, frame: int, array: NDArray[Any]) -> bool:
+def check_scan(writer: SequenceWriter, field: str, frame: int, array: AnyArray) -> bool:
     """Compare an existing field of a scan with the array of this run.
 
     Returns:
@@ -247,7 +245,7 @@ def _other_data(where: str, frame: int) -> ConflictError:
     )
 
 
-def scans_digest(sequence: Sequence, frames: NDArray[np.int64]) -> str:
+def scans_digest(sequence: Sequence, frames: IntArray) -> str:
     """Return a digest of 16 scans of a sequence.
 
     Changes of other scans are not detected, but long drives need not be read.
@@ -271,7 +269,7 @@ def _bytes_of(sequence: Sequence, name: str, frame: int) -> bytes:
     return b""
 
 
-def derived_key(sequence: Sequence, frames: NDArray[np.int64], scans: str, **settings: Any) -> str:
+def derived_key(sequence: Sequence, frames: IntArray, scans: str, **settings: Any) -> str:
     """Return a digest of settings, poses, times and scans.
 
     It identifies data derived from a sequence, such as actors or refined poses.

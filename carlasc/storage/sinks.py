@@ -9,10 +9,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
-from numpy.typing import NDArray
-
+from carlasc.core.arrays import AnyArray
 from carlasc.errors import ConflictError
 from carlasc.storage.protocol import Source
 
@@ -61,7 +60,7 @@ class SequenceWriter(ABC):
         """
 
     @abstractmethod
-    def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
+    def write(self, field: str, frame: int, array: AnyArray) -> None:
         """Write one field of one frame. An existing one is replaced.
 
         The params.json of a grid must be written before its first frame. Stores that append need
@@ -77,7 +76,7 @@ class SequenceWriter(ABC):
             FormatError: the array does not fit the field.
         """
 
-    def write_frames(self, frames: Mapping[int, Mapping[str, NDArray[Any]]]) -> None:
+    def write_frames(self, frames: Mapping[int, Mapping[str, AnyArray]]) -> None:
         """Write the fields of several frames, in the given order.
 
         `frames` maps frame numbers to fields by name, with the shapes of `write`.
@@ -110,7 +109,7 @@ class SequenceWriter(ABC):
         Runs use this to continue the output of an earlier run.
         """
 
-    def read(self, field: str, frame: int) -> NDArray[Any] | None:
+    def read(self, field: str, frame: int) -> AnyArray | None:
         """Return an existing field of a frame as a flat array or (N, columns) rows; None if the
         store cannot read it.
         """

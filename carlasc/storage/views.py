@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from carlasc.core.arrays import AnyArray, IntArray
 from carlasc.storage.protocol import Sequence, Source
 
 
@@ -28,11 +25,11 @@ class SequenceView(Sequence):
         """Return the fields of the whole sequence."""
         return self.whole.fields()
 
-    def frames(self, field: str) -> NDArray[np.int64]:
+    def frames(self, field: str) -> IntArray:
         """Return the frames of a field of the whole sequence."""
         return self.whole.frames(field)
 
-    def read(self, field: str, frame: int) -> NDArray[Any]:
+    def read(self, field: str, frame: int) -> AnyArray:
         """Read one field of one frame of the whole sequence."""
         return self.whole.read(field, frame)
 

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import Float32Array
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import FolderSource, Sequence, Sink, Source
@@ -135,7 +135,7 @@ class SourceContract:
         self, source: Source
     ) -> None:
         sequence = source.sequences()[WHOLE]
-        spare: list[NDArray[np.float32]] = []
+        spare: list[Float32Array] = []
         for frames in ([0, 1, 2], [5, 2], [1, 0, 5]):
             arrays = sequence.read_xyz(frames, spare)
             for frame, xyz in zip(frames, arrays, strict=True):

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from carlasc import storage
 from carlasc.converting import Converter, LayoutOptions, convert, load_converter
 from carlasc.converting.registry import open_converter
+from carlasc.core.arrays import AnyArray, FloatArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import invert, relative_to, transform_points
 from carlasc.motion import PoseOptions
@@ -56,7 +56,7 @@ class ConverterContract:
         """Write the drive into an empty folder, in the format of the data set."""
         raise NotImplementedError
 
-    def arrange(self, frame: int, values: list[NDArray[Any]]) -> NDArray[Any]:
+    def arrange(self, frame: int, values: list[AnyArray]) -> AnyArray:
         """Return values of the points of all sensors in the order of the converted scan.
 
         The default is sensor by sensor.
@@ -247,7 +247,7 @@ class ConverterContract:
         return load_converter(self.converter) if isinstance(self.converter, str) else self.converter
 
     @property
-    def _scan_T_first(self) -> NDArray[np.float64]:
+    def _scan_T_first(self) -> FloatArray:
         """(4, 4) from the frame of the first sensor to the frame of the scan, which has the axes of
         the vehicle.
         """
@@ -258,7 +258,7 @@ class ConverterContract:
     def _scans(self, frame: int):  # type: ignore[no-untyped-def]
         return [self.drive.scan(frame, sensor) for sensor in range(len(self.drive.sensors))]
 
-    def _points(self, frame: int) -> Iterator[NDArray[np.float64]]:
+    def _points(self, frame: int) -> Iterator[FloatArray]:
         """Yield the points of each sensor in the frame of the scan at the time of the frame."""
         first = self.drive.sensors[0].vehicle_T_sensor[:3, 3]
         for sensor, scan in zip(self.drive.sensors, self._scans(frame), strict=True):
@@ -283,7 +283,7 @@ class ConverterContract:
         return sequence.frames("labels").tolist()
 
 
-def _centers(sequence: Sequence, frame: int) -> NDArray[np.float64]:
+def _centers(sequence: Sequence, frame: int) -> FloatArray:
     boxes = sequence.boxes(frame)
     assert boxes is not None
     return boxes.centers

@@ -10,11 +10,10 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, AnyFloatArray, FloatArray, LabelArray, Uint8Array
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import invert, multiply, rotations_of
 from carlasc.errors import ArgumentError
@@ -45,7 +44,7 @@ def params(size: tuple[int, int, int], coordinates: str = "cartesian") -> bytes:
     return json.dumps(settings).encode()
 
 
-def scan(rng: np.random.Generator, count: int) -> dict[str, NDArray[Any]]:
+def scan(rng: np.random.Generator, count: int) -> dict[str, AnyArray]:
     """Return the fields of a random scan: points, labels, flow and instances."""
     points = np.zeros((count, 4), np.float32)
     points[:, :3] = rng.normal(scale=10, size=(count, 3))
@@ -72,7 +71,7 @@ def boxes(rng: np.random.Generator, count: int) -> Boxes:
 
 def grid(
     rng: np.random.Generator, size: tuple[int, int, int], whole: bool = True
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, AnyArray]:
     """Return the labels and counts of a random grid; `whole` counts are integers."""
     counts = rng.integers(0, 40, size).astype(np.float32)
     return {
@@ -83,7 +82,7 @@ def grid(
 
 def evidence(
     rng: np.random.Generator, size: tuple[int, int, int], wide: bool = False
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, AnyArray]:
     """Return the evidence fields of a random grid; `wide` class ids have two bytes."""
     voxels = int(np.prod(size))
     classes = np.zeros(
@@ -100,9 +99,7 @@ def evidence(
     }
 
 
-def actors(
-    rng: np.random.Generator, size: tuple[int, int, int], count: int
-) -> dict[str, NDArray[Any]]:
+def actors(rng: np.random.Generator, size: tuple[int, int, int], count: int) -> dict[str, AnyArray]:
     """Return the instance and velocity of a random grid with `count` moving voxels."""
     velocity = np.zeros(count, field_files.VELOCITY_DTYPE)
     velocity["voxel"] = np.sort(rng.permutation(int(np.prod(size)))[:count])
@@ -188,18 +185,18 @@ def write_dataset(root: Path, seed: int = 0) -> Path:
 
 
 def _write_all(
-    writer: SequenceWriter, frame: int, fields: Mapping[str, NDArray[Any]], grid: str = ""
+    writer: SequenceWriter, frame: int, fields: Mapping[str, AnyArray], grid: str = ""
 ) -> None:
     """Write fields of a frame; with `grid`, the fields of a grid."""
     for name, array in fields.items():
         writer.write(f"{grid}/{name}" if grid else name, frame, array)
 
 
-def _bytes(rng: np.random.Generator, shape: int | tuple[int, ...]) -> NDArray[np.uint8]:
+def _bytes(rng: np.random.Generator, shape: int | tuple[int, ...]) -> Uint8Array:
     return rng.integers(0, 256, shape).astype(np.uint8)
 
 
-def published_bytes(field: str, array: NDArray[Any]) -> bytes:
+def published_bytes(field: str, array: AnyArray) -> bytes:
     """Return the bytes of the published file of an array of any shape.
 
     They do not depend on the type in which a store keeps the array.
@@ -208,14 +205,14 @@ def published_bytes(field: str, array: NDArray[Any]) -> bytes:
 
 
 def wrong_labels(
-    labels: NDArray[np.unsignedinteger],
-    points: NDArray[np.floating],
+    labels: LabelArray,
+    points: AnyFloatArray,
     share: float,
     *,
     clump_m: float | None = None,
     classes: Iterable[int] | None = None,
     seed: int = 0,
-) -> NDArray[np.unsignedinteger]:
+) -> LabelArray:
     """Return a copy of labels in which a share is wrong. Points with class 0 are unchanged.
 
     Clumps are cubes. The wrong clumps and their classes depend on their position and on `seed`.
@@ -272,7 +269,7 @@ def wrong_labels(
 
 
 def wrong_poses(
-    poses: NDArray[np.float64],
+    poses: FloatArray,
     *,
     jitter_m: float = 0.0,
     jitter_rad: float = 0.0,
@@ -280,7 +277,7 @@ def wrong_poses(
     drift_rad: float = 0.0,
     height_drift_m: float = 0.0,
     seed: int = 0,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Return poses with errors. Equal arguments give equal poses.
 
     Args:
@@ -326,7 +323,7 @@ def wrong_poses(
     return wrong
 
 
-def _turns(rng: np.random.Generator, count: int, deviation_rad: float) -> NDArray[np.float64]:
+def _turns(rng: np.random.Generator, count: int, deviation_rad: float) -> FloatArray:
     """Return (count, 4, 4) small rotations."""
     turns = np.tile(np.eye(4), (count, 1, 1))
     half = rng.normal(0.0, deviation_rad, (count, 3)) / 2

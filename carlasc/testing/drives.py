@@ -8,9 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting.protocol import Sensor
+from carlasc.core.arrays import Float32Array, FloatArray, IntArray, Uint8Array, Uint32Array
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert, rotation_z, transform_points
 
@@ -41,7 +41,7 @@ class Thing:
     heading: float = 0.0
     speed: float = 0.0
 
-    def world_T_box(self, seconds: NDArray[np.float64] | float) -> NDArray[np.float64]:
+    def world_T_box(self, seconds: FloatArray | float) -> FloatArray:
         """Return the (..., 4, 4) pose of the box at some times."""
         poses = np.broadcast_to(rotation_z(self.heading), (*np.shape(seconds), 4, 4)).copy()
         way = np.asarray(seconds)[..., None] * (
@@ -89,12 +89,12 @@ class DriveScan:
         world_T_sensor: (N, 4, 4) pose of the sensor at the time of each point.
     """
 
-    points: NDArray[np.float32]
-    deskewed: NDArray[np.float32]
-    kinds: NDArray[np.uint8]
-    instances: NDArray[np.uint32]
-    seconds: NDArray[np.float64]
-    world_T_sensor: NDArray[np.float64]
+    points: Float32Array
+    deskewed: Float32Array
+    kinds: Uint8Array
+    instances: Uint32Array
+    seconds: FloatArray
+    world_T_sensor: FloatArray
 
 
 @dataclass(frozen=True)
@@ -142,11 +142,11 @@ class SimulatedDrive:
     )
 
     @property
-    def times(self) -> NDArray[np.float64]:
+    def times(self) -> FloatArray:
         """(F,) seconds."""
         return np.arange(self.frames, dtype=np.float64) * self.period_s
 
-    def world_T_vehicle(self, seconds: NDArray[np.float64] | float) -> NDArray[np.float64]:
+    def world_T_vehicle(self, seconds: FloatArray | float) -> FloatArray:
         """Return the (..., 4, 4) poses of the vehicle at some times.
 
         It moves slightly from side to side.
@@ -248,8 +248,8 @@ class SimulatedDrive:
         return tuple(thing for thing in self.things if thing.kind in MOVABLE)
 
     def _nearest(
-        self, origins: NDArray[np.float64], directions: NDArray[np.float64], at: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        self, origins: FloatArray, directions: FloatArray, at: FloatArray
+    ) -> tuple[FloatArray, IntArray]:
         """Return the length of each ray, and what it hits: 0 for the ground, n for the n-th thing
         from 1.
         """

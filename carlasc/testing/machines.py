@@ -17,11 +17,10 @@ from __future__ import annotations
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray
 from carlasc.errors import ConflictError, DependencyError
 from carlasc.storage import Sink, Source, layout
 from carlasc.storage.sinks import SequenceWriter
@@ -90,12 +89,12 @@ class StoreMachine(RuleBasedStateMachine):
         """Choose a new path for a store."""
         self._stores += 1
         self.out = Path(self._folder.name) / f"store{self._stores}{self.ending}"
-        self.model: dict[Key, NDArray[Any]] = {}
+        self.model: dict[Key, AnyArray] = {}
         self.documents: dict[tuple[str, str], bytes] = {}
         self._sink: Sink | None = None
         self._writers: dict[str, SequenceWriter] = {}
         # possible arrays of a frame that was replaced before a kill
-        self._possible: dict[Key, list[NDArray[Any]]] = {}
+        self._possible: dict[Key, list[AnyArray]] = {}
         self._killed = False
 
     def teardown(self) -> None:
@@ -186,7 +185,7 @@ class StoreMachine(RuleBasedStateMachine):
                 self._write((path, "points", 0), _array("points", 0, 0), self._writers[path])
         return self._writers[path]
 
-    def _write(self, key: Key, array: NDArray[Any], writer: SequenceWriter) -> None:
+    def _write(self, key: Key, array: AnyArray, writer: SequenceWriter) -> None:
         if not self.immediate and key in self.model:
             self._possible.setdefault(key, []).append(self.model[key])
         writer.write(key[1], key[2], array)
@@ -243,7 +242,7 @@ class StoreMachine(RuleBasedStateMachine):
         assert texts == self.documents
 
 
-def _array(field: str, frame: int, seed: int) -> NDArray[Any]:
+def _array(field: str, frame: int, seed: int) -> AnyArray:
     """Return a random array of a field.
 
     All fields of a frame have the same number of points: 0 to 3.

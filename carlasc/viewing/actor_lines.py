@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyFloatArray, FloatArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import transform_points
 from carlasc.core.scans import Scan
@@ -25,7 +25,7 @@ _EDGES = [
 ]
 
 
-def edges_of(size: NDArray[np.floating]) -> NDArray[np.float64]:
+def edges_of(size: AnyFloatArray) -> FloatArray:
     """Return the (13, 2, 3) ends of the edges of a box, and of a bar on its floor from its middle
     to its front, metres, frame of the box.
     """
@@ -34,7 +34,7 @@ def edges_of(size: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.array([*((corners[a], corners[b]) for a, b in _EDGES), bar])
 
 
-def box_lines(boxes: Boxes) -> NDArray[np.float64]:
+def box_lines(boxes: Boxes) -> FloatArray:
     """Return (L, 2, 3) both ends of the lines of `edges_of` of all boxes, metres, sensor frame."""
     ends = [
         transform_points(pose, edges_of(size).reshape(-1, 3))
@@ -43,7 +43,7 @@ def box_lines(boxes: Boxes) -> NDArray[np.float64]:
     return np.concatenate([np.empty((0, 3)), *ends]).reshape(-1, 2, 3)
 
 
-def motion_arrows(moving: Scan) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def motion_arrows(moving: Scan) -> tuple[FloatArray, FloatArray]:
     """Return (M, 3) start points and (M, 3) vectors of the arrows that show how actors move, in
     metres.
 
@@ -94,7 +94,7 @@ class Trail(NamedTuple):
 
     actor: int
     label: int
-    points: NDArray[np.float64]
+    points: FloatArray
 
 
 @dataclass
@@ -105,7 +105,7 @@ class Trails:
     """
 
     # positions of actors, by frame
-    _seen: dict[int, dict[int, NDArray[np.float64]]] = field(default_factory=dict)
+    _seen: dict[int, dict[int, FloatArray]] = field(default_factory=dict)
 
     def follow(
         self, position: int, content: FrameContent, moving: Scan | None
@@ -142,9 +142,7 @@ class Trails:
         )
 
 
-def _actors(
-    content: FrameContent, moving: Scan | None
-) -> Iterator[tuple[int, int, NDArray[np.float64]]]:
+def _actors(content: FrameContent, moving: Scan | None) -> Iterator[tuple[int, int, FloatArray]]:
     """Yield number, class and (3,) position of each actor, in the frame of the sensor."""
     boxes = content.boxes
     if boxes is not None:

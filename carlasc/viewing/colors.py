@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyFloatArray, AnyIntArray, IntArray, Uint8Array
 from carlasc.core.choices import PaletteName as PaletteName  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable, Color
 from carlasc.core.scans import Scan
@@ -78,7 +78,7 @@ _RAMP = np.array(  # viridis at five positions: lightness increases from the fir
 )
 
 
-def actor_ids(instances: NDArray[np.integer]) -> NDArray[np.uint8]:
+def actor_ids(instances: AnyIntArray) -> Uint8Array:
     """Return the id in `ACTORS` of each number of an actor, of any shape; 0, no actor, has the id
     1.
     """
@@ -125,19 +125,19 @@ class ClassColors:
         check_choice("palette", self.palette, PALETTES)
 
     @property
-    def by_id(self) -> NDArray[np.uint8]:
+    def by_id(self) -> Uint8Array:
         """(num_channels, 3) uint8 RGB by class id."""
         return (
             colorblind_palette(self.table) if self.palette == "colorblind" else self.table.palette
         )
 
-    def of_points(self, scan: Scan) -> NDArray[np.uint8]:
+    def of_points(self, scan: Scan) -> Uint8Array:
         """Return (N, 3) uint8 RGB of the points of a scan by class: grey without one."""
         colors = self.by_id.copy()
         colors[0] = UNLABELLED
         return colors[np.zeros(len(scan), np.int64) if scan.labels is None else scan.labels]
 
-    def tell_shapes(self, ids: NDArray[np.int64]) -> bool:
+    def tell_shapes(self, ids: IntArray) -> bool:
         """Whether the colours of the (K,) ids that occur are useful.
 
         Without labels they are not, and colours by height are used.
@@ -157,7 +157,7 @@ class ClassColors:
         ]
 
 
-def colorblind_palette(table: ClassTable) -> NDArray[np.uint8]:
+def colorblind_palette(table: ClassTable) -> Uint8Array:
     """Return (num_channels, 3) uint8 RGB by class id, in colours that readers with red-green
     blindness can distinguish.
     """
@@ -178,7 +178,7 @@ def colorblind_palette(table: ClassTable) -> NDArray[np.uint8]:
     return palette
 
 
-def height_colors(heights: NDArray[np.floating], lower: float, upper: float) -> NDArray[np.uint8]:
+def height_colors(heights: AnyFloatArray, lower: float, upper: float) -> Uint8Array:
     """Return (..., 3) uint8 RGB of heights: dark at `lower`, light at `upper`, both in metres."""
     position = np.clip((heights - lower) / max(upper - lower, 1e-9), 0, 1) * (len(_RAMP) - 1)
     places = np.arange(len(_RAMP))
@@ -198,7 +198,7 @@ def height_entries(lower: float, upper: float) -> list[Entry]:
     ]
 
 
-def as_color(rgb: NDArray[np.uint8]) -> Color:
+def as_color(rgb: Uint8Array) -> Color:
     """Return an RGB array as three plain integers."""
     red, green, blue = (int(value) for value in rgb)
     return red, green, blue

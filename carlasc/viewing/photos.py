@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, FloatArray
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import Transform, transform_points
 from carlasc.errors import FormatError, import_extra
@@ -40,7 +39,7 @@ class Photo:
         """The format of the image: "jpeg" or "png"."""
         return "png" if self.data.startswith(b"\x89PNG") else "jpeg"
 
-    def frustum(self, depth_m: float) -> NDArray[np.float64]:
+    def frustum(self, depth_m: float) -> FloatArray:
         """Return (8, 2, 3) lines of the frustum of the camera up to a depth, in the frame of the
         scan.
         """
@@ -95,11 +94,11 @@ def photos_of(sequence: Sequence, frame: int, mirrored: bool) -> tuple[Photo, ..
     return tuple(photos)
 
 
-def encode_photos(photos: tuple[Photo, ...]) -> dict[str, NDArray[Any]]:
+def encode_photos(photos: tuple[Photo, ...]) -> dict[str, AnyArray]:
     """Encode the images of a frame for a page: `photos/NAME`, the bytes of a small JPEG, and
     `actors/cameras`, both ends of the lines of their frustums.
     """
-    arrays: dict[str, NDArray[Any]] = {
+    arrays: dict[str, AnyArray] = {
         f"photos/{photo.camera.name}": np.frombuffer(photo.smaller(_PHOTO_PX), np.uint8)
         for photo in photos
     }

@@ -12,11 +12,10 @@ from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, FloatArray, IntArray, LabelArray, Uint32Array
 from carlasc.core.axes import mirror_boxes, mirror_poses, mirror_scan, mirror_spec, mirror_voxels
 from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable
@@ -149,7 +148,7 @@ class Scene:
             )
         return contents
 
-    def _choose_frames(self, part: NamedPart, available: NDArray[np.int64]) -> tuple[int, ...]:
+    def _choose_frames(self, part: NamedPart, available: IntArray) -> tuple[int, ...]:
         frames = FrameRange.of(self.frames)
         if self.frames is None and part.frame is not None:
             frames = FrameRange(part.frame, part.frame + 1)
@@ -305,7 +304,7 @@ def common_table(
 
 def frames_with(
     data: RemappedSequence, truth: RemappedSequence | None, contents: tuple[str, ...]
-) -> NDArray[np.int64]:
+) -> IntArray:
     """Return the frames that have all contents."""
     own = {"scan": ("points",), "flow": ("points", "flow"), "truth": ()}
     needed = [
@@ -313,7 +312,7 @@ def frames_with(
     ]
     if truth is not None and {"truth", "errors"} & set(contents):
         needed.append((truth.sequence, f"{truth.grid}/labels"))
-    frames: NDArray[np.int64] | None = None
+    frames: IntArray | None = None
     for sequence, name in needed:
         available = sequence.frames(name)
         if not len(available):
@@ -336,7 +335,7 @@ def list_fields(sequence: Sequence) -> str:
     return ", ".join(sorted(sequence.fields())) or "nothing"
 
 
-def describe_frames(frames: NDArray[np.int64]) -> str:
+def describe_frames(frames: IntArray) -> str:
     """Return the first and the last of some frames and their number, for a message."""
     return f"{frames[0]} to {frames[-1]} ({len(frames)} frames)"
 
@@ -434,7 +433,7 @@ class RemappedSequence:
         """Return the frames that have all of these fields."""
         return set.intersection(*(set(self.sequence.frames(field).tolist()) for field in fields))
 
-    def read_part(self, part: str, frame: int) -> NDArray[Any]:
+    def read_part(self, part: str, frame: int) -> AnyArray:
         """Read a part of the grid of a frame, such as "posterior", in the shape of the grid.
 
         Raises:
@@ -447,9 +446,7 @@ class RemappedSequence:
         where = f"{self.sequence.location}: boxes, frame {frame}"
         return replace(boxes, labels=self._remap(boxes.labels, self.scan_table, where))
 
-    def _remap(
-        self, labels: NDArray[np.unsignedinteger], stored: ClassTable, where: str
-    ) -> NDArray[np.unsignedinteger]:
+    def _remap(self, labels: LabelArray, stored: ClassTable, where: str) -> LabelArray:
         target = self.shown or stored
         labels = to_table(labels, stored, target, where)
         target.check(labels, where)
@@ -670,7 +667,7 @@ class SceneReader:
             pose = self.truth.read_pose(frame)
         return mirror_poses(pose) if self.mirrored and pose is not None else pose
 
-    def path_of_ego(self) -> NDArray[np.float64]:
+    def path_of_ego(self) -> FloatArray:
         """Return the (F, 3) positions of the sensor in all frames, metres in the frame of the first
         scan; none without poses.
         """
@@ -688,7 +685,7 @@ class SceneReader:
             return None
         return self.data.sequence.read("bev", frame).tobytes()
 
-    def _instances(self, frame: int) -> NDArray[np.uint32]:
+    def _instances(self, frame: int) -> Uint32Array:
         """Return the number of the actor of each voxel, in the shape of the grid; 0 without one."""
         if frame not in self.data.frames_with(f"{self.data.grid}/instance"):
             return np.zeros(self.data.spec.size, np.uint32)

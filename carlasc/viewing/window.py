@@ -15,8 +15,8 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, Uint8Array
 from carlasc.errors import DependencyError, import_extra
 from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc.viewing.rendering.drawings import ego_vehicle
@@ -130,7 +130,7 @@ class Window:
         self.report(self.looks[self.look])
         self._draw()
 
-    def picture(self) -> NDArray[np.uint8]:
+    def picture(self) -> Uint8Array:
         """Return a screenshot, (H, W, 3) uint8."""
         self.tick()
         image = np.asarray(self._visualizer.capture_screen_float_buffer(do_render=True))
@@ -166,7 +166,7 @@ class Window:
         surface.vertex_colors = self._vectors(mesh.colors[:, None] / 255 * light[..., None])
         return surface
 
-    def _vectors(self, values: NDArray[Any]) -> Any:
+    def _vectors(self, values: AnyArray) -> Any:
         return self._o3d.utility.Vector3dVector(np.asarray(values, np.float64).reshape(-1, 3))
 
 

@@ -21,6 +21,7 @@ from carlasc.converting.protocol import (
     Trajectory,
 )
 from carlasc.core import CameraModel
+from carlasc.core.arrays import AnyFloatArray, FloatArray, IntArray, Uint32Array
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import translation
 from carlasc.errors import FormatError, MissingDataError
@@ -102,7 +103,7 @@ class Argoverse2Log(Recording):
         return dict(sorted((int(path.stem), path) for path in files if _is_sweep(path)))
 
     @cached_property
-    def _annotated(self) -> NDArray[np.int64]:
+    def _annotated(self) -> IntArray:
         """(A,) timestamps of the annotated sweeps in nanoseconds, increasing; none if nothing is
         annotated.
         """
@@ -113,7 +114,7 @@ class Argoverse2Log(Recording):
         )
 
     @cached_property
-    def _timeline(self) -> NDArray[np.int64]:
+    def _timeline(self) -> IntArray:
         """(F,) timestamp of each frame in nanoseconds."""
         return np.union1d(np.array(list(self._sweeps), np.int64), self._annotated)
 
@@ -195,11 +196,11 @@ class Argoverse2Log(Recording):
         poses = poses_of(_stack(table, _QUATERNION), _stack(table, _TRANSLATION), str(self._poses))
         return Trajectory(poses, self._seconds(table["timestamp_ns"]), str(self._poses))
 
-    def times(self) -> NDArray[np.float64]:
+    def times(self) -> FloatArray:
         """Return seconds after the first frame."""
         return self._seconds(self._timeline)
 
-    def _seconds(self, timestamps: NDArray[np.int64]) -> NDArray[np.float64]:
+    def _seconds(self, timestamps: IntArray) -> FloatArray:
         """Return seconds after the first frame.
 
         Nanoseconds are subtracted as integers, because float64 would round them to 64 ns.
@@ -244,7 +245,7 @@ class Argoverse2Log(Recording):
             )
         return cameras
 
-    def _images_of(self, name: str) -> tuple[NDArray[np.float64] | None, tuple[str, ...] | None]:
+    def _images_of(self, name: str) -> tuple[FloatArray | None, tuple[str, ...] | None]:
         """Return the time and the path of the image nearest to each frame; None if the camera has
         no images.
         """
@@ -367,11 +368,11 @@ def _is_sweep(path: Path) -> bool:
     return path.suffix == ".feather" and path.stem.isascii() and path.stem.isdigit()
 
 
-def _stack(table: Mapping[str, NDArray[np.floating]], names: Sequence[str]) -> NDArray[np.float64]:
+def _stack(table: Mapping[str, AnyFloatArray], names: Sequence[str]) -> FloatArray:
     return np.stack([table[name].astype(np.float64) for name in names], axis=1)
 
 
-def _labels(categories: NDArray[np.object_], where: str) -> NDArray[np.uint32]:
+def _labels(categories: NDArray[np.object_], where: str) -> Uint32Array:
     """Return the class id of each category."""
     names, rows = np.unique(categories, return_inverse=True)
     if unknown := [str(name) for name in names if name not in CATEGORIES]:

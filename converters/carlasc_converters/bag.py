@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting.protocol import Converter, FrameHandle, Recording, Sensor, Trajectory
 from carlasc.core import CameraModel
+from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, FormatError, MissingDataError
 from carlasc_converters.bag_messages import PATH, TRANSFORMS, read_placed
@@ -138,7 +138,7 @@ class BagRecording(Recording):
             sensors.append(Sensor(lidar.name, place, deskewed=self._options.deskewed))
         return sensors
 
-    def times(self) -> NDArray[np.float64]:
+    def times(self) -> FloatArray:
         """Return seconds after the first frame."""
         return self._seconds(self._lidars[0].stamps)
 
@@ -296,9 +296,7 @@ class BagRecording(Recording):
                 f"{errors[0]}: so {len(errors)} of {len(places)} messages are left out"
             )
 
-    def _poses_of_tree(
-        self, *, required: bool
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+    def _poses_of_tree(self, *, required: bool) -> tuple[IntArray, FloatArray] | None:
         """Return times and poses of the vehicle in the world; None if the vehicle does not move in
         the tree.
         """
@@ -330,7 +328,7 @@ class BagRecording(Recording):
             self.location, expected=expected, found=f"only {self._tree}", advice=advice
         )
 
-    def _seconds(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+    def _seconds(self, stamps: IntArray) -> FloatArray:
         """Return seconds after the first frame.
 
         Nanoseconds are subtracted as integers, because float64 would round them to 256 ns.

@@ -22,8 +22,8 @@ from struct import unpack_from
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray
 from carlasc.core.geometry import Transform
 from carlasc.errors import FormatError, import_extra, reading
 from carlasc_converters import foxglove_messages
@@ -65,7 +65,7 @@ class FileIndex:
     path: str
     channels: dict[int, Channel] = field(default_factory=dict)
     lost: str | None = None
-    _parts: dict[int, list[NDArray[Any]]] = field(default_factory=dict)
+    _parts: dict[int, list[AnyArray]] = field(default_factory=dict)
 
     def add(self, channel: int, chunk: int, times: Any, offsets: Any) -> None:
         """Add messages of a channel that are in one chunk, or in none (-1)."""
@@ -73,7 +73,7 @@ class FileIndex:
         part["time"], part["chunk"], part["offset"] = times, chunk, offsets
         self._parts.setdefault(channel, []).append(part)
 
-    def places(self, channel: int) -> NDArray[Any]:
+    def places(self, channel: int) -> AnyArray:
         """Return (N,) `PLACE`, the messages of a channel, in the order of the file."""
         return np.concatenate([np.empty(0, PLACE), *self._parts.get(channel, [])])
 
@@ -171,7 +171,7 @@ class CloudMessage:
 
     stamp_ns: int
     frame: str
-    columns: dict[str, NDArray[Any]]
+    columns: dict[str, AnyArray]
     pose: Transform | None = None
     time_unit: TimeUnit | None = None
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from carlasc.converting.protocol import Cloud, FrameHandle
 from carlasc.core import CameraModel
+from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.cameras import Lens
 from carlasc.core.geometry import Transform, transform_points
 from carlasc.errors import FormatError, reading
@@ -59,7 +60,7 @@ class LidarTopic:
             )
 
     @cached_property
-    def _read(self) -> tuple[NDArray[np.int64], list[MessagePlace]]:
+    def _read(self) -> tuple[IntArray, list[MessagePlace]]:
         """The time and position of each message, by time.
 
         An unreadable message follows the one before it; reading its frame reports the error.
@@ -86,7 +87,7 @@ class LidarTopic:
         return times, [places[row] for row in first]
 
     @property
-    def stamps(self) -> NDArray[np.int64]:
+    def stamps(self) -> IntArray:
         """(F,) increasing times in nanoseconds."""
         return self._read[0]
 
@@ -139,7 +140,7 @@ class LidarTopic:
             raise problem
         return "auto"
 
-    def nearest(self, stamps: NDArray[np.int64]) -> list[MessagePlace | None]:
+    def nearest(self, stamps: IntArray) -> list[MessagePlace | None]:
         """Return the message nearest to each time; None if it is farther away than the interval of
         messages.
         """
@@ -213,7 +214,7 @@ class BagFrame(FrameHandle):
 
     def _seconds_of(
         self, message: CloudMessage, times: NDArray[np.generic] | None, unit: TimeUnit, where: str
-    ) -> NDArray[np.float64] | None:
+    ) -> FloatArray | None:
         """Return the time of each point after the time of the frame; None if it is not known."""
         late = (message.stamp_ns - self.stamp_ns) * 1e-9
         if times is None:
@@ -269,7 +270,7 @@ class BagCamera:
         return str(self.message.header.frame_id).removeprefix("/")
 
     @cached_property
-    def images(self) -> tuple[NDArray[np.int64], list[MessagePlace]]:
+    def images(self) -> tuple[IntArray, list[MessagePlace]]:
         """(N,) increasing times of the images, nanoseconds, and their positions."""
         places = [] if self.topic is None else list(self.topic.places())
         stamps = np.array(
@@ -278,7 +279,7 @@ class BagCamera:
         times, first = np.unique(stamps, return_index=True)
         return times, [places[row] for row in first.tolist()]
 
-    def nearest(self, frames: NDArray[np.int64]) -> list[int | None]:
+    def nearest(self, frames: IntArray) -> list[int | None]:
         """Return the row of the image nearest to each of (F,) times, nanoseconds; None if it is
         nearer to another frame.
         """
@@ -290,7 +291,7 @@ class BagCamera:
         near = np.abs(times[rows] - frames) <= period / 2
         return [row if ok else None for row, ok in zip(rows.tolist(), near.tolist(), strict=True)]
 
-    def model(self, vehicle_T_camera: Transform, times: NDArray[np.float64] | None) -> CameraModel:
+    def model(self, vehicle_T_camera: Transform, times: FloatArray | None) -> CameraModel:
         """Return the camera; images that the topic calls rectified have no distortion.
 
         Raises:

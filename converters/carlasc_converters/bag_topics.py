@@ -10,8 +10,8 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import IntArray, RecordArray
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc_converters import db3_file, mcap_file, ros1_bag
 from carlasc_converters.bag_messages import (
@@ -77,10 +77,10 @@ class Topic:
     """
 
     channel: Channel
-    parts: list[tuple[str, Channel, NDArray[np.void]]] = field(default_factory=list)
+    parts: list[tuple[str, Channel, RecordArray]] = field(default_factory=list)
 
     @cached_property
-    def times(self) -> NDArray[np.int64]:
+    def times(self) -> IntArray:
         """(N,) times at which the messages were recorded, nanoseconds."""
         return np.concatenate([np.empty(0, np.int64), *(rows["time"] for _, _, rows in self.parts)])
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray
 from carlasc.core.geometry import Transform, check_rigid
 from carlasc.errors import ArgumentError, FormatError, import_extra
 from carlasc_converters.files import opening, read_text
@@ -91,6 +91,6 @@ def axes_named(name: str) -> Transform:
     return transform
 
 
-def in_axes(transform: Transform, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def in_axes(transform: Transform, poses: FloatArray) -> FloatArray:
     """Return (..., 4, 4) poses after a change of the axes of both their frames."""
     return transform @ poses @ transform.T

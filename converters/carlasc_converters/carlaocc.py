@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting import (
     Cloud,
@@ -27,6 +26,7 @@ from carlasc.converting import (
     Trajectory,
     VoxelContent,
 )
+from carlasc.core.arrays import FloatArray
 from carlasc.core.benchmarks import CARLAOCC, CARLAOCC_TO_CARLA
 from carlasc.core.geometry import check_rigid
 from carlasc.core.grids import GridSpec
@@ -168,7 +168,7 @@ class CarlaOccRecording(Recording):
         poses = check_rigid(rows[:, 1:].reshape(-1, 4, 4), str(path))
         return Trajectory(poses, rows[:, 0] * _PERIOD_S, str(path))
 
-    def times(self) -> NDArray[np.float64]:
+    def times(self) -> FloatArray:
         """Return the times of a simulation with ten frames per second."""
         last = max((frame.number for frame in self.frames), default=-1)
         return np.arange(last + 1, dtype=np.float64) * _PERIOD_S

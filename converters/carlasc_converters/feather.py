@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from numpy.typing import NDArray
-
+from carlasc.core.arrays import AnyArray
 from carlasc.errors import FormatError, MissingDataError, import_extra
 from carlasc_converters.files import opening
 
 
 def read_columns(
     path: Path, names: Sequence[str], texts: Sequence[str] = ()
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, AnyArray]:
     """Read columns of a Feather file.
 
     Args:

@@ -9,10 +9,8 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
-from numpy.typing import NDArray
-
+from carlasc.core.arrays import AnyArray
 from carlasc.errors import FormatError, MissingDataError, reading
 from carlasc.storage import layout
 from carlasc.storage.arrays import ArrayFormat, open_npz
@@ -92,7 +90,7 @@ def read_text(
 
 def read_arrays(
     path: str | Path, formats: Mapping[str, ArrayFormat], advice: str
-) -> list[NDArray[Any]]:
+) -> list[AnyArray]:
     """Return some arrays of an .npz file, in the order of their names. No pickle is read.
 
     Args:

@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+
+from carlasc.core.arrays import BoolArray, IntArray
 
 
-def nearest_rows(stamps: NDArray[np.int64], frames: NDArray[np.int64]) -> NDArray[np.int64]:
+def nearest_rows(stamps: IntArray, frames: IntArray) -> IntArray:
     """Return (F,) the row of the stamp nearest to each frame.
 
     Args:
@@ -22,8 +23,8 @@ def nearest_rows(stamps: NDArray[np.int64], frames: NDArray[np.int64]) -> NDArra
 
 
 def nearest_images(
-    paths: Mapping[int, Path], frames: NDArray[np.int64], within: int
-) -> tuple[NDArray[np.int64], NDArray[np.bool_], tuple[str, ...]]:
+    paths: Mapping[int, Path], frames: IntArray, within: int
+) -> tuple[IntArray, BoolArray, tuple[str, ...]]:
     """Return the stamp of the image nearest to each frame, whether it is near enough, and its
     absolute path, "" where it is not.
 

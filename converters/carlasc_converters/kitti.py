@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting import (
     Cloud,
@@ -22,6 +21,7 @@ from carlasc.converting import (
     Trajectory,
     VoxelContent,
 )
+from carlasc.core.arrays import FloatArray, Uint16Array, Uint32Array
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import Transform, check_rigid, inverse_of, multiply
 from carlasc.core.tables import REMAPS, SEMANTICKITTI
@@ -150,7 +150,7 @@ class KittiRecording(Recording):
             calibration, calibration.transform("Tr"), projections, image_of, numbers
         )
 
-    def times(self) -> NDArray[np.float64] | None:
+    def times(self) -> FloatArray | None:
         """Return the lines of times.txt."""
         path = self.folder / "times.txt"
         return layout.decode_times(read_bytes(path), str(path)) if path.is_file() else None
@@ -202,7 +202,7 @@ class KittiFrame(FrameHandle):
             )
         return [Cloud(points, labels, instances)]
 
-    def _read_labels(self) -> tuple[NDArray[np.uint16] | None, NDArray[np.uint32] | None]:
+    def _read_labels(self) -> tuple[Uint16Array | None, Uint32Array | None]:
         """Read classes (the low 16 bits) and instances (the high 16 bits)."""
         if not self.labelled:
             return None, None

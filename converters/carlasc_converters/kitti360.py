@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting import Cloud, FrameHandle, Recording, Sensor, Split, Trajectory
 from carlasc.core import CameraModel
+from carlasc.core.arrays import Float32Array, FloatArray, IntArray
 from carlasc.core.geometry import Transform, check_rigid, invert
 from carlasc.errors import FormatError, MissingDataError
 from carlasc_converters.files import Version, read_text, version_of
@@ -156,7 +156,7 @@ class Kitti360Drive(Recording):
             else None
         )
 
-    def times(self) -> NDArray[np.float64] | None:
+    def times(self) -> FloatArray | None:
         """Return the times at which the scanner looked forward, seconds after the first."""
         return self._times.seconds
 
@@ -249,9 +249,7 @@ class Kitti360Frame(FrameHandle):
         labels, instances = label_points(self.files.labels, self.window, self.number, world)
         return [Cloud(points, labels, instances, seconds)]
 
-    def _in_world(
-        self, points: NDArray[np.float32], seconds: NDArray[np.float32]
-    ) -> NDArray[np.float64]:
+    def _in_world(self, points: Float32Array, seconds: Float32Array) -> FloatArray:
         """Return (N, 3) points in the frame of the world, each by the pose at its time."""
         times, trajectory = _motion(self.files, version_of(self.files.poses, "poses"))
         ticks, tick_of = np.unique(np.round(seconds / _TICK_S), return_inverse=True)
@@ -260,7 +258,7 @@ class Kitti360Frame(FrameHandle):
 
 
 @lru_cache(maxsize=2)  # drives per process
-def _motion(files: Kitti360Files, version: Version) -> tuple[NDArray[np.float64], Trajectory]:
+def _motion(files: Kitti360Files, version: Version) -> tuple[FloatArray, Trajectory]:
     """Return the times of a drive's frames, and its poses."""
     times = FrameTimes.read(
         files.scans / "timestamps.txt", frames_of(files.scans / "data", ".bin")
@@ -268,9 +266,7 @@ def _motion(files: Kitti360Files, version: Version) -> tuple[NDArray[np.float64]
     return times, read_trajectory(files, times)
 
 
-def read_trajectory(
-    files: Kitti360Files, times: NDArray[np.float64], *, force: bool = False
-) -> Trajectory:
+def read_trajectory(files: Kitti360Files, times: FloatArray, *, force: bool = False) -> Trajectory:
     """Return the poses of the LiDAR from the poses of the IMU in poses.txt.
 
     Args:
@@ -301,7 +297,7 @@ def read_trajectory(
     return Trajectory(held, times[np.concatenate([before, frames, after])], str(files.poses))
 
 
-def _read_poses(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _read_poses(path: Path) -> tuple[IntArray, FloatArray]:
     """Return (K,) frame numbers and (K, 4, 4) poses."""
     try:
         rows = [

@@ -14,8 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import (
+    AnyIntArray,
+    FloatArray,
+    IntArray,
+    RecordArray,
+    Uint16Array,
+    Uint32Array,
+)
 from carlasc.core.scans import check_finite
 from carlasc.errors import import_extra
 from carlasc_converters.files import Version, version_of
@@ -41,11 +48,11 @@ class Labelled:
     """
 
     tree: Any
-    labels: NDArray[np.uint16]
-    instances: NDArray[np.uint32]
+    labels: Uint16Array
+    instances: Uint32Array
 
     @classmethod
-    def of(cls, rows: NDArray[np.void], where: str) -> Labelled:
+    def of(cls, rows: RecordArray, where: str) -> Labelled:
         """Return the points of some vertices of a file, which is named in errors.
 
         Raises:
@@ -65,7 +72,7 @@ class Labelled:
         numbered = np.clip(rows["instance"], 0, None).astype(np.uint32)
         return cls(tree, labels, np.where(numbered % _PER_CLASS > 0, numbered, 0).astype(np.uint32))
 
-    def nearest(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def nearest(self, points: FloatArray) -> tuple[FloatArray, IntArray]:
         """Return the distance and the index of the nearest point for each of (M, 3) points;
         infinite if none is near enough.
         """
@@ -98,8 +105,8 @@ def window_at(windows: dict[str, tuple[int, int]], frame: int) -> str | None:
 
 
 def label_points(
-    folder: Path, window: str, frame: int, world: NDArray[np.float64]
-) -> tuple[NDArray[np.uint16], NDArray[np.uint32]]:
+    folder: Path, window: str, frame: int, world: FloatArray
+) -> tuple[Uint16Array, Uint32Array]:
     """Return the class and the instance of each point of a scan: those of the nearest labelled
     point within `MAX_DISTANCE_M`.
 
@@ -141,7 +148,7 @@ def _standing(path: str, version: Version) -> Labelled:
 
 
 @lru_cache(maxsize=1)
-def _by_time(path: str, version: Version) -> tuple[NDArray[np.void], NDArray[np.integer]]:
+def _by_time(path: str, version: Version) -> tuple[RecordArray, AnyIntArray]:
     """Return the vertices of a dynamic file by increasing time stamp, and their time stamps."""
     rows = np.array(PlyVertices.open(path, (*_COLUMNS, "timestamp")).read())
     rows = rows[np.argsort(rows["timestamp"], kind="stable")]

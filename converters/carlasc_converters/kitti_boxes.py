@@ -6,8 +6,8 @@ Points have no labels there.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable, Color, Remap
 from carlasc.core.tables import CARLA
@@ -69,7 +69,7 @@ class BoxRows:
 
     def __init__(self, where: str, frames: list[int]) -> None:
         self._where = where
-        self._rows: dict[int, list[tuple[int, int, NDArray[np.float64], NDArray[np.float64], bool]]]
+        self._rows: dict[int, list[tuple[int, int, FloatArray, FloatArray, bool]]]
         self._rows = {frame: [] for frame in frames}
 
     def add(
@@ -77,8 +77,8 @@ class BoxRows:
         frame: int,
         track: int,
         label: int,
-        lidar_T_box: NDArray[np.float64],
-        size: NDArray[np.float64],
+        lidar_T_box: FloatArray,
+        size: FloatArray,
         *,
         annotated: bool = True,
     ) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting import Converter
+from carlasc.core.arrays import AnyArray, AnyIntArray, Float32Array, FloatArray
 from carlasc.core.geometry import Transform, check_rigid
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import layout
@@ -50,7 +51,7 @@ def read_lines(path: Path, expected: str, content: str) -> list[str]:
     return [line.strip() for line in read_text(path, content).rstrip().splitlines()]
 
 
-def read_array(path: str, dtype: np.dtype[Any], columns: int) -> NDArray[Any]:
+def read_array(path: str, dtype: np.dtype[Any], columns: int) -> AnyArray:
     """Read a file of rows without a header, as (N, columns) of `dtype`.
 
     Raises:
@@ -70,7 +71,7 @@ def read_array(path: str, dtype: np.dtype[Any], columns: int) -> NDArray[Any]:
     return data.view(dtype).reshape(-1, columns)
 
 
-def read_scan(path: str) -> NDArray[np.float32]:
+def read_scan(path: str) -> Float32Array:
     """Read a scan: (N, 4) float32 x forward, y left, z up in metres, and reflectance 0 to 1, in the
     frame of the scanner.
 
@@ -84,7 +85,7 @@ def read_scan(path: str) -> NDArray[np.float32]:
     return points
 
 
-def sweep_seconds(points: NDArray[np.float32], period_s: float) -> NDArray[np.float32]:
+def sweep_seconds(points: Float32Array, period_s: float) -> Float32Array:
     """Return (N,) the time of each point after the time of its scan, from its azimuth.
 
     The scanner turns once in `period_s`. A sweep begins behind the car and passes the left side,
@@ -181,7 +182,7 @@ class Calibration:
             )
         return values
 
-    def _rigid(self, rows: NDArray[np.float64], name: str) -> Transform:
+    def _rigid(self, rows: FloatArray, name: str) -> Transform:
         transform = np.eye(4)
         transform[:3, : rows.shape[1]] = rows
         return check_rigid(transform, f"{self.path}: {name}" if name else str(self.path))
@@ -221,7 +222,7 @@ class FrameTimes:
     """
 
     start: np.datetime64
-    seconds: NDArray[np.float64]
+    seconds: FloatArray
 
     @classmethod
     def read(cls, path: Path, frames: Sequence[int]) -> FrameTimes:
@@ -260,7 +261,7 @@ class FrameTimes:
         before = np.clip(numbers[0] - every, 0, None) * _period(numbers, seconds)
         return cls(stamps[0], np.interp(every, numbers, seconds) - before)
 
-    def of(self, stamps: NDArray[np.datetime64]) -> NDArray[np.float64]:
+    def of(self, stamps: NDArray[np.datetime64]) -> FloatArray:
         """Return the seconds of other time stamps by the same clock."""
         return np.asarray((stamps - self.start) / _NANOSECOND, np.float64) * 1e-9
 
@@ -270,7 +271,7 @@ class FrameTimes:
         return _period(np.arange(len(self.seconds)), self.seconds)
 
 
-def _period(numbers: NDArray[np.integer], seconds: NDArray[np.float64]) -> float:
+def _period(numbers: AnyIntArray, seconds: FloatArray) -> float:
     return (
         float(np.median(np.diff(seconds) / np.diff(numbers)))
         if len(seconds) > 1

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting import Cloud, FrameHandle, Recording, Sensor, Split, Trajectory
+from carlasc.core.arrays import FloatArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import Transform, invert
@@ -129,7 +129,7 @@ class RawDrive(Recording):
         later = seconds > np.concatenate([[-np.inf], np.maximum.accumulate(seconds)[:-1]])
         return Trajectory(world_T_lidar[later], seconds[later], str(path))
 
-    def _packet(self, number: int) -> NDArray[np.float64]:
+    def _packet(self, number: int) -> FloatArray:
         path = self.folder / "oxts" / "data" / f"{number:010d}.txt"
         packets = read_packets(path)
         if len(packets) != 1:
@@ -148,7 +148,7 @@ class RawDrive(Recording):
         )
         return Calibration.read(path, expected).rotation_and_translation()
 
-    def times(self) -> NDArray[np.float64] | None:
+    def times(self) -> FloatArray | None:
         """Return the times at which the scanner looked forward, seconds after the first."""
         return self._times.seconds
 

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting import Cloud, FrameHandle, Recording, Sensor, Split, Trajectory
+from carlasc.core.arrays import FloatArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import Transform, invert
@@ -145,7 +145,7 @@ class TrackingSequence(Recording):
         )
         return self._calibration(purpose).transform("Tr_imu_to_velo", "Tr_imu_velo")
 
-    def times(self) -> NDArray[np.float64] | None:
+    def times(self) -> FloatArray | None:
         """Return times at the mean rate of KITTI's raw data: the benchmark has none."""
         return np.arange(self._numbers[-1] + 1, dtype=np.float64) * PERIOD_S
 
@@ -239,7 +239,7 @@ def _camera_T_lidar(calibration: Calibration) -> Transform:
     return calibration.rotation("R0_rect", "R_rect") @ to_camera
 
 
-def _camera_T_box(center: NDArray[np.float64], turn_rad: float) -> Transform:
+def _camera_T_box(center: FloatArray, turn_rad: float) -> Transform:
     """Return the pose of a box in the camera's frame (x right, y down, z forward), from its
     rotation about y.
     """

@@ -8,9 +8,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting import VoxelContent
+from carlasc.core.arrays import BoolArray
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
 from carlasc_converters.files import read_bytes
@@ -21,12 +21,12 @@ _SUFFIXES = (".label", *MASKS)
 _COPY = "the file is incomplete: copy it again"
 
 
-def pack_bits(mask: NDArray[np.bool_]) -> bytes:
+def pack_bits(mask: BoolArray) -> bytes:
     """Return a mask as packed bits: C order, the first voxel in the most significant bit."""
     return np.packbits(mask.reshape(-1)).tobytes()
 
 
-def unpack_bits(data: bytes, size: tuple[int, int, int], where: str) -> NDArray[np.bool_]:
+def unpack_bits(data: bytes, size: tuple[int, int, int], where: str) -> BoolArray:
     """Return the mask of `size` that packed bits hold.
 
     Raises:

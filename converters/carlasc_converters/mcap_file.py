@@ -10,8 +10,8 @@ from struct import unpack, unpack_from
 from zlib import crc32
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import RecordArray
 from carlasc.errors import FormatError
 from carlasc_converters.bag_messages import Channel, FileIndex, decompressed, ros_type
 from carlasc_converters.files import Version, version_of
@@ -105,7 +105,7 @@ class _McapRecords:
         self.channels: dict[int, tuple[str, int, str]] = {}
         self.loose: dict[int, list[tuple[int, int]]] = {}
         self.chunk = -1
-        self._entries: list[tuple[int, NDArray[np.void]]] = []
+        self._entries: list[tuple[int, RecordArray]] = []
 
     def take(self, kind: int, content: bytes, at: int) -> None:
         """Take a record outside of chunks."""
@@ -147,7 +147,7 @@ class _McapRecords:
             times, offsets = np.array(places, np.int64).T
             self.index.add(number, chunk, times, offsets)
 
-    def _add(self, chunk: int, entries: list[tuple[int, NDArray[np.void]]]) -> None:
+    def _add(self, chunk: int, entries: list[tuple[int, RecordArray]]) -> None:
         for number, rows in entries:
             self.index.add(
                 number, chunk, rows["time"].astype(np.int64), rows["offset"].astype(np.int64)

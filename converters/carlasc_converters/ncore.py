@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting import Cloud, Converter, FrameHandle, Recording, Sensor, Trajectory
 from carlasc.core import CameraModel
+from carlasc.core.arrays import AnyArray, FloatArray, IntArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, check_rigid, invert, multiply, quaternions_of
 from carlasc.errors import FormatError, MissingDataError, count
@@ -123,7 +123,7 @@ class NcoreRecording(Recording):
         return groups.get("default") or next(iter(groups.values()), None)
 
     @cached_property
-    def _spans(self) -> dict[str, NDArray[np.int64]]:
+    def _spans(self) -> dict[str, IntArray]:
         """(F, 2) microseconds of the start and the end of each frame, by LiDAR that has frames."""
         spans = {}
         for name, (store, group) in self._components["lidars"].items():
@@ -141,7 +141,7 @@ class NcoreRecording(Recording):
         return {name: self._components["lidars"][name] for name in self._spans}
 
     @cached_property
-    def _first(self) -> NDArray[np.int64]:
+    def _first(self) -> IntArray:
         """(F, 2) microseconds of the frames of the first LiDAR."""
         return next(iter(self._spans.values()))
 
@@ -173,9 +173,7 @@ class NcoreRecording(Recording):
     @cached_property
     def _tree(self) -> FrameTree:
         """The frames of coordinates, as a tree below the world."""
-        edges: dict[str, list[tuple[str, NDArray[np.int64], NDArray[np.float64]]]] = defaultdict(
-            list
-        )
+        edges: dict[str, list[tuple[str, IntArray, FloatArray]]] = defaultdict(list)
         if (component := self._component("poses")) is not None:
             store, group = component
             with opening(f"{store.path}: {group}", "poses between frames"):
@@ -233,11 +231,11 @@ class NcoreRecording(Recording):
             )
         return sensors
 
-    def times(self) -> NDArray[np.float64]:
+    def times(self) -> FloatArray:
         """Return seconds after the first frame."""
         return self._seconds(self._first[:, 1])
 
-    def _seconds(self, stamps_us: NDArray[Any]) -> NDArray[np.float64]:
+    def _seconds(self, stamps_us: AnyArray) -> FloatArray:
         return (stamps_us - self._first[0, 1]) / 1e6
 
     def poses(self, *, force: bool = False) -> Trajectory | None:
@@ -375,7 +373,7 @@ class NcoreRecording(Recording):
         frame = int(np.argmin(away))
         return frame if away[frame] <= self._slack_us else -1
 
-    def _between(self, reference: str, stamps: NDArray[np.int64]) -> Transform:
+    def _between(self, reference: str, stamps: IntArray) -> Transform:
         """Return (4, 4) from a frame at the second time to the rig at the first time."""
         if not self._tree.connected(reference, self._vehicle):
             raise MissingDataError(
@@ -435,7 +433,7 @@ class NcoreFrame(FrameHandle):
         points = np.empty((len(ray), 4), np.float32)
         points[:, :3] = rays["direction"][ray] * distance[which, ray, None]
         points[:, 3] = np.nan_to_num(returns["intensity"][which, ray])
-        seconds: NDArray[Any] = (rays["timestamp_us"][ray].astype(np.int64) - self.end_us) / 1e6
+        seconds: AnyArray = (rays["timestamp_us"][ray].astype(np.int64) - self.end_us) / 1e6
         return Cloud(points, seconds=seconds, sensor=index)
 
 

@@ -8,9 +8,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.core import CameraModel
+from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.cameras import Lens
 from carlasc.core.geometry import Transform
 from carlasc.errors import FormatError
@@ -56,13 +56,13 @@ class NcoreCamera:
         return "thin prisms" if np.any(given.get("thin_prism_coeffs", 0)) else None
 
     @cached_property
-    def spans(self) -> NDArray[np.int64]:
+    def spans(self) -> IntArray:
         """(N, 2) microseconds of the start and the end of each image, increasing."""
         with opening(f"{self.store.path}: {self.group}/frames", "the times of images"):
             given = self.store.attributes(f"{self.group}/frames").get("frames_timestamps_us", [])
             return np.array(given, np.int64).reshape(-1, 2)
 
-    def nearest(self, ends: NDArray[np.int64], within: float) -> list[int | None]:
+    def nearest(self, ends: IntArray, within: float) -> list[int | None]:
         """Return the row of the image whose middle is nearest to each of (F,) times, microseconds;
         None if none is near enough.
         """
@@ -73,7 +73,7 @@ class NcoreCamera:
         near = np.abs(middles[rows] - ends) <= within
         return [row if ok else None for row, ok in zip(rows.tolist(), near.tolist(), strict=True)]
 
-    def model(self, vehicle_T_camera: Transform, times: NDArray[np.float64] | None) -> CameraModel:
+    def model(self, vehicle_T_camera: Transform, times: FloatArray | None) -> CameraModel:
         """Return the camera; `times` are those of the images of each frame, seconds.
 
         Raises:

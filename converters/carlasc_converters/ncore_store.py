@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray
 from carlasc.errors import FormatError, MissingDataError, import_extra
 from carlasc.storage.arrays import check_size
 from carlasc_converters.files import COPY, Version, opening, read_bytes, version_of
@@ -113,7 +113,7 @@ class NcoreStore:
         names = (key[len(before) : -len(after)] for key in within)
         return sorted(name for name in names if name and "/" not in name)
 
-    def array(self, name: str) -> NDArray[Any]:
+    def array(self, name: str) -> AnyArray:
         """Return a whole array.
 
         Raises:

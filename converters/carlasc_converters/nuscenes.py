@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting.protocol import Converter, FrameHandle, Recording, Sensor, Split, Trajectory
 from carlasc.core import CameraModel
+from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
@@ -203,18 +203,18 @@ class NuScenesScene(Recording):
             f"{self.tables.path('ego_pose')}: {self.scene.name}",
         )
 
-    def _global_T_vehicle(self, rows: Sequence[int]) -> NDArray[np.float64]:
+    def _global_T_vehicle(self, rows: Sequence[int]) -> FloatArray:
         """Return (N, 4, 4) poses of rows of the poses in the tables."""
         numbers = self.tables.poses[1][rows]
         return poses_of(
             numbers[:, 3:], numbers[:, :3], f"{self.tables.path('ego_pose')}: {self.scene.name}"
         )
 
-    def times(self) -> NDArray[np.float64]:
+    def times(self) -> FloatArray:
         """Return seconds after the first frame."""
         return self._seconds(np.array([scan.timestamp for scan in self._scans], np.int64))
 
-    def _seconds(self, microseconds: NDArray[np.int64]) -> NDArray[np.float64]:
+    def _seconds(self, microseconds: IntArray) -> FloatArray:
         return np.asarray(microseconds - self._scans[0].timestamp, np.float64) * 1e-6
 
     def cameras(self) -> Sequence[CameraModel]:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting.protocol import Cloud, FrameHandle
+from carlasc.core.arrays import AnyArray, Float32Array, Uint16Array, Uint32Array
 from carlasc.core.boxes import Boxes
 from carlasc.errors import FormatError
 from carlasc.storage.arrays import ArrayFormat
@@ -58,7 +57,7 @@ class NuScenesFrame(FrameHandle):
         points = np.frombuffer(data, "<f4").reshape(-1, _COLUMNS)[:, :4].copy()
         points[:, 3] /= 255.0
         panoptic = None if self.instances is None else _read_panoptic(self.instances)
-        labels: NDArray[Any] | None = None
+        labels: AnyArray | None = None
         if self.labels is not None:
             labels = np.frombuffer(_read(self.labels), np.uint8)
             _check_labels(labels, len(points), self.labels)
@@ -70,8 +69,8 @@ class NuScenesFrame(FrameHandle):
 
 
 def number_instances(
-    panoptic: NDArray[np.uint16], points: NDArray[np.float32], boxes: Boxes | None
-) -> NDArray[np.uint32]:
+    panoptic: Uint16Array, points: Float32Array, boxes: Boxes | None
+) -> Uint32Array:
     """Return the number of the object of each point: that of the box with the class of the object
     that holds most of its points.
 
@@ -102,14 +101,14 @@ def _read(path: str) -> bytes:
     return read_bytes(path, "a file that the tables list", "unpack it again")
 
 
-def _read_panoptic(path: str) -> NDArray[np.uint16]:
+def _read_panoptic(path: str) -> Uint16Array:
     """Return the panoptic labels of a file."""
     return read_arrays(
         path, {"data": ArrayFormat(("u1", "<u2", "<u4"), (None,))}, "unpack it again"
     )[0]
 
 
-def _check_labels(labels: NDArray[Any], points: int, path: str) -> None:
+def _check_labels(labels: AnyArray, points: int, path: str) -> None:
     """Check that there is a class of the table for each point."""
     if len(labels) != points:
         raise FormatError(

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray, Int32Array, IntArray, Uint32Array
 from carlasc.core.geometry import Transform
 from carlasc.errors import FormatError
 from carlasc.storage.files import leads_outside
@@ -74,7 +74,7 @@ class CameraRow:
 
     channel: str
     vehicle_T_camera: Transform
-    matrix: NDArray[np.float64]
+    matrix: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,10 +121,10 @@ class Annotations:
             quaternion w, x, y, z.
     """
 
-    samples: NDArray[np.int32]
-    instances: NDArray[np.int32]
-    labels: NDArray[np.uint32]
-    numbers: NDArray[np.float64]
+    samples: Int32Array
+    instances: Int32Array
+    labels: Uint32Array
+    numbers: FloatArray
 
     def of(self, sample: int) -> Annotations:
         """Return the boxes of one sample."""
@@ -294,7 +294,7 @@ class Tables:
             )
 
     @cached_property
-    def poses(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def poses(self) -> tuple[IntArray, FloatArray]:
         """(P,) timestamps in microseconds, and (P, 7) x, y, z, qw, qx, qy, qz of the vehicle in the
         global frame, at LiDAR scans.
         """
@@ -354,6 +354,6 @@ class Tables:
         )
 
 
-def _columns(rows: list[tuple[Any, ...]], place: int, width: int) -> NDArray[np.float64]:
+def _columns(rows: list[tuple[Any, ...]], place: int, width: int) -> FloatArray:
     """Return one value of each row, which is a list of `width` numbers, as (N, width)."""
     return np.array([row[place] for row in rows], np.float64).reshape(-1, width)

@@ -7,8 +7,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray
 from carlasc.errors import FormatError
 from carlasc_converters.kitti_files import read_lines
 
@@ -16,7 +16,7 @@ COLUMNS = 30
 _EARTH_M = 6378137.0
 
 
-def read_packets(path: Path) -> NDArray[np.float64]:
+def read_packets(path: Path) -> FloatArray:
     """Read the packets of a file, one per line.
 
     Returns:
@@ -42,7 +42,7 @@ def read_packets(path: Path) -> NDArray[np.float64]:
     return packets
 
 
-def world_T_imu(packets: NDArray[np.float64]) -> NDArray[np.float64]:
+def world_T_imu(packets: FloatArray) -> FloatArray:
     """Return (K, 4, 4) poses of the IMU (x forward, y left, z up) in a world with x to the east, y
     to the north and z up, metres.
 
@@ -62,7 +62,7 @@ def world_T_imu(packets: NDArray[np.float64]) -> NDArray[np.float64]:
     return poses
 
 
-def _about(axis: int, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+def _about(axis: int, angles: FloatArray) -> FloatArray:
     """Return (K, 3, 3) rotations about an axis."""
     one, other = (axis + 1) % 3, (axis + 2) % 3
     rotations = np.tile(np.eye(3), (len(angles), 1, 1))

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting import Cloud, Converter, FrameHandle, Recording, Sensor, Split, Trajectory
+from carlasc.core.arrays import Float32Array, FloatArray, IntArray
 from carlasc.core.classes import Remap
 from carlasc.core.geometry import Transform, invert, rotation_z, transform_points, translation
 from carlasc.core.tables import CARLA
@@ -107,7 +107,7 @@ class ParisCarlaTown(Recording):
         return [(value, tuple(ranges[value])) for value in sorted(ranges)]
 
     @cached_property
-    def _middles(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _middles(self) -> tuple[FloatArray, FloatArray]:
         """(F, 3) position and (F,) time of the LiDAR at the middle point of each scan."""
         rows = [
             self._ply.rows(row, row + 1)[0]
@@ -119,7 +119,7 @@ class ParisCarlaTown(Recording):
         return positions, np.array([row["timestamp"] for row in rows], np.float64)
 
     @cached_property
-    def _poses(self) -> NDArray[np.float64]:
+    def _poses(self) -> FloatArray:
         """(F, 4, 4) world_T_scan: the position of the LiDAR, upright, with the direction of motion
         as heading.
         """
@@ -158,7 +158,7 @@ class ParisCarlaTown(Recording):
         """Return the pose of each scan: see `notes`."""
         return Trajectory(self._poses, self._middles[1], str(self.path))
 
-    def times(self) -> NDArray[np.float64]:
+    def times(self) -> FloatArray:
         """Return the time of the middle point of each scan."""
         return self._middles[1]
 
@@ -198,7 +198,7 @@ class ParisCarlaFrame(FrameHandle):
         rows = np.concatenate([self.ply.rows(start, stop) for start, stop in self.ranges])
         scan_T_world = invert(self.world_T_scan)
 
-        def in_scan(names: tuple[str, ...]) -> NDArray[np.float32]:
+        def in_scan(names: tuple[str, ...]) -> Float32Array:
             return transform_points(
                 scan_T_world, np.stack([rows[name] for name in names], axis=1)
             ).astype(np.float32)
@@ -217,7 +217,7 @@ class ParisCarlaFrame(FrameHandle):
         return (cloud,)
 
 
-def headings(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+def headings(positions: FloatArray) -> FloatArray:
     """Return the (F,) direction of motion, radians about z, at each of (F, 3) positions.
 
     It is the direction from an earlier to a later position, the same number of frames before and
@@ -240,15 +240,15 @@ def headings(positions: NDArray[np.float64]) -> NDArray[np.float64]:
     return headings[known[last]]
 
 
-def _find_runs(ply: PlyVertices) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _find_runs(ply: PlyVertices) -> tuple[IntArray, IntArray]:
     """Return the (R,) values of index_frame of the runs of consecutive rows of one scan, and the (R
     + 1,) rows where they begin and end.
 
     Raises:
         FormatError: the file has no rows, or the rows of a scan are scattered over it.
     """
-    values: list[NDArray[np.int64]] = []
-    starts: list[NDArray[np.int64]] = []
+    values: list[IntArray] = []
+    starts: list[IntArray] = []
     done, runs, last = 0, 0, -1
     for chunk in ply.chunks():
         column = chunk["index_frame"].astype(np.int64)

@@ -9,11 +9,11 @@ import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, Uint8Array
 from carlasc.core.compiling import cached
 from carlasc.errors import FormatError
 from carlasc_converters.files import COPY, opening
@@ -39,7 +39,7 @@ class PcdHeader:
     encoding: str
 
 
-def read_pcd(path: str | Path) -> dict[str, NDArray[Any]]:
+def read_pcd(path: str | Path) -> dict[str, AnyArray]:
     """Return the fields of the points of a PCD file, each (N,), or (N, count) for a field of
     several values.
 
@@ -143,7 +143,7 @@ def _unpacked(body: bytes, row: np.dtype[np.void], count: int, where: str) -> by
 
 
 @cached
-def _lzf(packed: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
+def _lzf(packed: Uint8Array, out: Uint8Array) -> int:
     """Decompress LZF data into `out`, and return the number of bytes; -1 if the data are damaged.
 
     The format: http://oldhome.schmorp.de/marc/liblzf.html.

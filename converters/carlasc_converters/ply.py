@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, BinaryIO, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import RecordArray
 from carlasc.errors import FormatError
 from carlasc_converters.files import opening
 
@@ -102,7 +102,7 @@ class PlyVertices:
     def __len__(self) -> int:
         return self.count
 
-    def read(self) -> NDArray[np.void]:
+    def read(self) -> RecordArray:
         """Return all vertices: an array of `dtype`, mapped from a binary file, read from a text
         file.
 
@@ -114,7 +114,7 @@ class PlyVertices:
             return self.rows(0, self.count)
         return next(self.chunks(max(1, self.count)), np.empty(0, self.dtype))
 
-    def rows(self, start: int, stop: int) -> NDArray[np.void]:
+    def rows(self, start: int, stop: int) -> RecordArray:
         """Return the vertices `start:stop` of a binary file, mapped from it.
 
         They need memory only when they are read, and only as long as the result exists.
@@ -137,7 +137,7 @@ class PlyVertices:
             self.path, self.dtype, "r", self.offset + start * self.dtype.itemsize, (stop - start,)
         )
 
-    def chunks(self, size: int = _CHUNK) -> Iterator[NDArray[np.void]]:
+    def chunks(self, size: int = _CHUNK) -> Iterator[RecordArray]:
         """Yield all vertices in their order, at most `size` at a time.
 
         Only one chunk is in memory if the caller keeps none.
@@ -157,7 +157,7 @@ class PlyVertices:
             for start in range(0, self.count, size):
                 yield self._parse(text, start, min(size, self.count - start))
 
-    def _parse(self, text: io.TextIOWrapper, start: int, count: int) -> NDArray[np.void]:
+    def _parse(self, text: io.TextIOWrapper, start: int, count: int) -> RecordArray:
         """Return the vertices of the next `count` lines.
 
         `numpy.loadtxt` with a structured type is the fastest parser without another package: 1.2

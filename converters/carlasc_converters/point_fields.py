@@ -8,8 +8,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, FloatArray, Uint8Array, Uint32Array
 from carlasc.errors import FormatError
 
 # Types of sensor_msgs/PointField:
@@ -17,7 +17,7 @@ from carlasc.errors import FormatError
 ROS_TYPES = dict(enumerate("i1 u1 i2 u2 i4 u4 f4 f8".split(), 1))
 
 
-def read_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
+def read_columns(message: Any, where: str) -> dict[str, AnyArray]:
     """Return the fields of a sensor_msgs/PointCloud2 by name; the points of all rows, one row after
     the other.
 
@@ -42,8 +42,8 @@ def read_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
 
 
 def unpack_fields(
-    data: NDArray[np.uint8], fields: Iterable[tuple[str, int, str, int]], step: int, where: str
-) -> dict[str, NDArray[Any]]:
+    data: Uint8Array, fields: Iterable[tuple[str, int, str, int]], step: int, where: str
+) -> dict[str, AnyArray]:
     """Return the fields of packed points by name.
 
     Args:
@@ -118,7 +118,7 @@ _SCAN_S = (0.004, 0.6)  # duration of a scan: 2 to 200 Hz; fact: scan-duration
 _ABSOLUTE_S = 1e6  # a time of a clock, not one within a scan
 
 
-def named_fields(columns: Mapping[str, NDArray[Any]], where: str) -> dict[str, NDArray[Any]]:
+def named_fields(columns: Mapping[str, AnyArray], where: str) -> dict[str, AnyArray]:
     """Return the fields of some points by one name each.
 
     Args:
@@ -149,7 +149,7 @@ def named_fields(columns: Mapping[str, NDArray[Any]], where: str) -> dict[str, N
     for axis, field in enumerate(("x", "y", "z", "intensity")):
         if given[field] is not None:
             points[:, axis] = given[field]
-    fields: dict[str, NDArray[Any]] = {"points": points}
+    fields: dict[str, AnyArray] = {"points": points}
     for field in ("time", "ring"):
         if (values := given[field]) is not None:
             fields[field] = values
@@ -159,7 +159,7 @@ def named_fields(columns: Mapping[str, NDArray[Any]], where: str) -> dict[str, N
     return fields
 
 
-def whole_numbers(values: NDArray[Any], where: str) -> NDArray[np.uint32]:
+def whole_numbers(values: AnyArray, where: str) -> Uint32Array:
     """Return (N,) ids as uint32.
 
     Raises:
@@ -174,8 +174,8 @@ def whole_numbers(values: NDArray[Any], where: str) -> NDArray[np.uint32]:
 
 
 def point_seconds(
-    times: NDArray[Any], unit: TimeUnit, where: str
-) -> tuple[NDArray[np.float64], int | None, TimeUnit]:
+    times: AnyArray, unit: TimeUnit, where: str
+) -> tuple[FloatArray, int | None, TimeUnit]:
     """Return the times of the points of a scan in seconds.
 
     Args:

@@ -6,11 +6,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray
 from carlasc.errors import ArgumentError, FormatError, import_extra
 from carlasc.storage.arrays import NUMBERS, ArrayFormat, open_npz, read_npy
 from carlasc_converters.files import COPY, opening, read_bytes
@@ -23,7 +22,7 @@ _FLOAT = 4
 _ARRAY = ArrayFormat(NUMBERS, None, records=True)
 
 
-def read_columns(path: Path, columns: tuple[str, ...] | None = None) -> dict[str, NDArray[Any]]:
+def read_columns(path: Path, columns: tuple[str, ...] | None = None) -> dict[str, AnyArray]:
     """Return the values of the points of a file, (N,) each, by their names in the file or in
     `columns`.
 
@@ -46,7 +45,7 @@ def read_columns(path: Path, columns: tuple[str, ...] | None = None) -> dict[str
     return columns_read
 
 
-def _read_bin(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:
+def _read_bin(path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray]:
     data = read_bytes(path)
     count, left = divmod(len(data), _FLOAT)
     if left:
@@ -72,11 +71,11 @@ def _read_bin(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[
     return dict(zip(columns, values.reshape(-1, len(columns)).T, strict=True))
 
 
-def _read_npy(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:
+def _read_npy(path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray]:
     return _named(read_npy(path, _ARRAY), path, columns)
 
 
-def _read_npz(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:
+def _read_npz(path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray]:
     with open_npz(path) as archive:
         arrays = {
             name: archive.read(name, _ARRAY)
@@ -97,9 +96,7 @@ def _read_npz(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[
     return _named(table, path, columns) | rest
 
 
-def _named(
-    array: NDArray[Any], path: Path, columns: tuple[str, ...] | None
-) -> dict[str, NDArray[Any]]:
+def _named(array: AnyArray, path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray]:
     """Return the columns of a structured array, or of a table (N, C)."""
     if array.dtype.names:
         return {name: array[name].reshape(-1) for name in array.dtype.names}
@@ -120,7 +117,7 @@ def _named(
     return dict(zip(names, array.T, strict=True))
 
 
-def _read_csv(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:
+def _read_csv(path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray]:
     with opening(path, "a table of numbers"), path.open(encoding="utf-8-sig") as file:
         first = file.readline()
         separator = "," if "," in first else None
@@ -143,16 +140,16 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _read_ply(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:
+def _read_ply(path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray]:
     rows = PlyVertices.open(path).read()
     return {name: rows[name] for name in rows.dtype.names or ()}
 
 
-def _read_pcd(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:
+def _read_pcd(path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray]:
     return {name: values for name, values in read_pcd(path).items() if values.ndim == 1}
 
 
-def _read_las(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:
+def _read_las(path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray]:
     laspy = import_extra("laspy", "scans")
     with opening(path, "a LAS file"):
         cloud = laspy.read(path)
@@ -165,7 +162,7 @@ def _read_las(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[
         return scaled | {name: np.asarray(cloud[name]) for name in names}
 
 
-_READERS: dict[str, Callable[[Path, tuple[str, ...] | None], dict[str, NDArray[Any]]]] = {
+_READERS: dict[str, Callable[[Path, tuple[str, ...] | None], dict[str, AnyArray]]] = {
     ".bin": _read_bin,
     ".npy": _read_npy,
     ".npz": _read_npz,

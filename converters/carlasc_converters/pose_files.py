@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.geometry import check_rigid
 from carlasc.errors import FormatError
 from carlasc.storage.arrays import NUMBERS, ArrayFormat, read_npy
@@ -47,8 +47,8 @@ class PoseRows:
         of: whose poses these are, if the format defines it.
     """
 
-    world_T_body: NDArray[np.float64]
-    stamps: NDArray[np.int64] | None
+    world_T_body: FloatArray
+    stamps: IntArray | None
     of: PoseOf
 
 
@@ -94,7 +94,7 @@ def read_poses(path: Path) -> PoseRows:
     )
 
 
-def read_stamps(path: Path) -> NDArray[np.int64]:
+def read_stamps(path: Path) -> IntArray:
     """Return the (F,) nanoseconds of a file of times: one number per line, or the first of several;
     seconds, or a unit by its magnitude.
 
@@ -147,7 +147,7 @@ def _split(line: str) -> list[str]:
     return [word.strip() for word in line.split(",")] if "," in line else line.split()
 
 
-def _numbers(rows: Sequence[list[str]], columns: int, path: Path) -> NDArray[np.float64]:
+def _numbers(rows: Sequence[list[str]], columns: int, path: Path) -> FloatArray:
     return np.array(
         _each(rows, lambda row: _floats(row, columns), f"{columns} numbers", path)
     ).reshape(-1, columns)
@@ -159,7 +159,7 @@ def _floats(row: list[str], columns: int) -> list[float]:
     return list(map(float, row))
 
 
-def _stamps(words: Sequence[str], path: Path, *, increasing: bool = True) -> NDArray[np.int64]:
+def _stamps(words: Sequence[str], path: Path, *, increasing: bool = True) -> IntArray:
     stamps = np.array(_each(words, nanoseconds, "a time", path), np.int64)
     if increasing and (np.diff(stamps) <= 0).any():
         line = int(np.argmax(np.diff(stamps) <= 0)) + 2
@@ -185,7 +185,7 @@ def _each(
     return values
 
 
-def _whole(poses: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
+def _whole(poses: FloatArray, path: Path) -> FloatArray:
     """Return (K, 4, 4) poses from (K, 3, 4) or (K, 4, 4)."""
     if poses.ndim != 3 or poses.shape[1:] not in ((3, 4), (4, 4)):
         raise FormatError(path, expected="an array (N, 4, 4) of poses", found=f"{poses.shape}")

@@ -12,8 +12,8 @@ from struct import unpack, unpack_from
 from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import RecordArray
 from carlasc.errors import FormatError
 from carlasc_converters.bag_messages import Channel, FileIndex, decompressed, ros_type
 from carlasc_converters.files import Version, version_of
@@ -30,7 +30,7 @@ _Fields = dict[bytes, bytes]
 def index_file(path: Path) -> FileIndex:
     """Return the index of the messages of a file."""
     index, size = FileIndex(str(path)), path.stat().st_size
-    at, chunk, entries, closed = len(MAGIC), -1, list[tuple[int, NDArray[np.void]]](), False
+    at, chunk, entries, closed = len(MAGIC), -1, list[tuple[int, RecordArray]](), False
     with path.open("rb") as file:
         while at < size:
             try:
@@ -88,7 +88,7 @@ def read_message(path: str, chunk: int, offset: int) -> bytes:
     return data[begin:end]
 
 
-def _add_chunk(index: FileIndex, chunk: int, entries: list[tuple[int, NDArray[np.void]]]) -> None:
+def _add_chunk(index: FileIndex, chunk: int, entries: list[tuple[int, RecordArray]]) -> None:
     """Add the messages of a chunk, from its index if there is one, or from its content."""
     if chunk < 0:
         return

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting import Cloud, FrameHandle
+from carlasc.core.arrays import Uint32Array
 from carlasc.core.geometry import Transform
 from carlasc.errors import FormatError
 from carlasc.relabelling.predictions import load
@@ -107,7 +107,7 @@ class ScanFile(FrameHandle):
         )
 
 
-def read_labels(path: Path, count: int) -> NDArray[np.uint32]:
+def read_labels(path: Path, count: int) -> Uint32Array:
     """Return the (N,) class ids of a file: .label (uint32, of which the lower 16 bits count), .npy,
     or .txt with one per line.
 

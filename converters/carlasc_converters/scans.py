@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting import Converter, FrameHandle, Recording, Sensor, Trajectory
+from carlasc.core.arrays import AnyArray, FloatArray, IntArray
 from carlasc.core.geometry import Transform, invert
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
@@ -197,7 +197,7 @@ class ScanFolder(Recording):
         return next(iter(self._files.values()))
 
     @cached_property
-    def _first(self) -> dict[str, NDArray[Any]]:
+    def _first(self) -> dict[str, AnyArray]:
         """The fields of the first scan."""
         return named_fields(
             read_columns(self._paths[0], self._options.columns), str(self._paths[0])
@@ -219,7 +219,7 @@ class ScanFolder(Recording):
         return None if self._options.pose_file is None else read_poses(self._options.pose_file)
 
     @cached_property
-    def _stamps(self) -> tuple[NDArray[np.int64] | None, str]:
+    def _stamps(self) -> tuple[IntArray | None, str]:
         """The (F,) nanoseconds of the scans, and their source."""
         count = len(self._paths)
         if self._options.time_file is not None:
@@ -314,7 +314,7 @@ class ScanFolder(Recording):
             for name in self._files
         ]
 
-    def times(self) -> NDArray[np.float64] | None:
+    def times(self) -> FloatArray | None:
         """Return seconds after the first scan; None if the times of scans are not known."""
         stamps, _ = self._stamps
         return None if stamps is None else (stamps - stamps[0]) / 1e9
@@ -397,5 +397,5 @@ def _natural(path: Path) -> list[Any]:
     return [int(part) if part.isdigit() else part.lower() for part in re.split(r"(\d+)", path.name)]
 
 
-def _span(stamps: NDArray[np.int64]) -> str:
+def _span(stamps: IntArray) -> str:
     return f"{stamps[0] / 1e9:.3f} to {stamps[-1] / 1e9:.3f} s"

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting import (
     Cloud,
@@ -29,6 +28,7 @@ from carlasc.converting import (
     Trajectory,
     VoxelContent,
 )
+from carlasc.core.arrays import FloatArray, Uint8Array
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.geometry import translation
 from carlasc.core.grids import GridSpec
@@ -188,7 +188,7 @@ class SynthCityArea(Recording):
         return self._spec.upper[0] - self._spec.lower[0]
 
     @property
-    def _centers(self) -> NDArray[np.float64]:
+    def _centers(self) -> FloatArray:
         """(F, 2) middle of each tile."""
         return (np.array(self._cut[1], np.float64) + 0.5) * self._step
 
@@ -301,9 +301,7 @@ def _find_columns(path: Path, named: Mapping[str, str]) -> dict[str, str]:
     return columns
 
 
-def _batches(
-    path: Path, columns: Mapping[str, str]
-) -> Iterator[tuple[NDArray[np.float64], NDArray[np.uint8]]]:
+def _batches(path: Path, columns: Mapping[str, str]) -> Iterator[tuple[FloatArray, Uint8Array]]:
     """Yield (N, 3) points and (N,) labels, counted from 1, of consecutive rows of a table.
 
     Raises:
@@ -338,7 +336,7 @@ def _batches(
             done += len(labels)
 
 
-def _numbers(path: Path, batch: Any, name: str) -> NDArray[np.float64]:
+def _numbers(path: Path, batch: Any, name: str) -> FloatArray:
     """Return a column of a batch as numbers."""
     column = batch.column(name).to_numpy(zero_copy_only=False)
     if column.dtype.kind not in "iuf":
@@ -349,7 +347,7 @@ def _numbers(path: Path, batch: Any, name: str) -> NDArray[np.float64]:
 
 
 def _append(
-    folder: str, points: NDArray[np.float64], labels: NDArray[np.uint8], step: float
+    folder: str, points: FloatArray, labels: Uint8Array, step: float
 ) -> set[tuple[int, int]]:
     """Append points to the files of their tiles, and return these tiles."""
     if not len(points):
@@ -382,7 +380,7 @@ def _tile_file(folder: str, tile: tuple[int, int]) -> str:
     return str(Path(folder) / f"{tile[0]}_{tile[1]}.bin")
 
 
-def _grounds(files: list[str], centers: NDArray[np.float64]) -> list[float]:
+def _grounds(files: list[str], centers: FloatArray) -> list[float]:
     """Return the height of the ground in each tile: the median of its ground points, those around
     the middle if there are enough.
 

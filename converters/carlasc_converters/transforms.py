@@ -9,17 +9,15 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyFloatArray, FloatArray, IntArray
 from carlasc.core.geometry import check_rigid, inverse_of, multiply, poses_from, slerp
 from carlasc.errors import FormatError
 
 _UNIT_TOLERANCE = 1e-3  # greatest deviation of a quaternion's norm from 1
 
 
-def poses_of(
-    quaternions: NDArray[np.floating], translations: NDArray[np.floating], where: str
-) -> NDArray[np.float64]:
+def poses_of(quaternions: AnyFloatArray, translations: AnyFloatArray, where: str) -> FloatArray:
     """Return the (N, 4, 4) float64 transforms with given rotations and translations.
 
     Args:
@@ -76,7 +74,7 @@ class FrameTrack:
         return len(self._stamps)
 
     @cached_property
-    def values(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def values(self) -> tuple[IntArray, FloatArray]:
         """(K,) increasing times in nanoseconds, and (K, 4, 4) poses: the last of each time.
 
         Raises:
@@ -96,7 +94,7 @@ class FrameTrack:
         poses = self.values[1]
         return bool(np.abs(poses - poses[0]).max() > _STILL)
 
-    def at(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+    def at(self, stamps: IntArray) -> FloatArray:
         """Return (M, 4, 4) poses at some times: interpolated, and constant before the first and
         after the last.
         """
@@ -149,7 +147,7 @@ class FrameTree:
         """Return whether there is a path between two frames."""
         return self.ancestors(one)[-1] == self.ancestors(other)[-1]
 
-    def lookup(self, target: str, source: str, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+    def lookup(self, target: str, source: str, stamps: IntArray) -> FloatArray:
         """Return (M, 4, 4) target_T_source at some times, of two frames that are connected."""
         above = self.ancestors(target)
         common = next(frame for frame in self.ancestors(source) if frame in above)
@@ -160,7 +158,7 @@ class FrameTree:
             else np.array([multiply(inverse_of(a), b) for a, b in zip(down, up, strict=True)])
         )
 
-    def _climb(self, frame: str, ancestor: str, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+    def _climb(self, frame: str, ancestor: str, stamps: IntArray) -> FloatArray:
         poses = np.tile(np.eye(4), (len(stamps), 1, 1))
         for track in self.edges(frame, ancestor):
             poses = multiply(track.at(stamps), poses)

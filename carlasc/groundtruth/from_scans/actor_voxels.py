@@ -9,8 +9,15 @@ from dataclasses import replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import (
+    AnyIntArray,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    Uint32Array,
+)
 from carlasc.core.geometry import invert, multiply, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import finite
@@ -22,7 +29,7 @@ from carlasc.storage.protocol import Sequence
 
 _CLASS_PARTS = 1 << 10  # in the upper 16 bits, smaller values may be a class
 _TURN_FRAMES = 3  # frames before and after, between which the turn rate of an actor is measured
-Numbered = tuple[NDArray[np.float32], NDArray[np.int64]]
+Numbered = tuple[Float32Array, IntArray]
 # the numbered points of scans
 _NUMBERED: WeakKeyDictionary[ScanFeed, dict[int, Numbered]] = WeakKeyDictionary()
 
@@ -45,7 +52,7 @@ def with_numbers(actors: MovingActors, feed: ScanFeed) -> MovingActors:
     return replace(actors, numbers=number_actors(actors.tracks, highest))
 
 
-def _numbers_of(sequence: Sequence) -> Iterator[NDArray[np.int64]]:
+def _numbers_of(sequence: Sequence) -> Iterator[IntArray]:
     """Yield the numbers of actors in the data: of the points of each scan, and of the tracks of its
     boxes.
     """
@@ -63,7 +70,7 @@ def find_voxels(
     now: Instant,
     regions: BodyRegions,
     window: list[int],
-    labels: NDArray[np.integer],
+    labels: AnyIntArray,
 ) -> VoxelActors:
     """Return the actors of the voxels of a frame.
 
@@ -100,9 +107,7 @@ def find_voxels(
     return VoxelActors.of(spec, instance, np.concatenate(voxels), np.concatenate(velocities))
 
 
-def velocity_at(
-    track: Track, frame: int, places: NDArray[np.float64], feed: ScanFeed
-) -> NDArray[np.float64]:
+def velocity_at(track: Track, frame: int, places: FloatArray, feed: ScanFeed) -> FloatArray:
     """Return the (N, 3) velocities, m/s, world, of (N, 3) positions on an actor, metres, world,
     which moves and turns about the vertical.
     """
@@ -129,8 +134,8 @@ def _number_points(
     actors: MovingActors,
     now: Instant,
     window: list[int],
-    free: NDArray[np.bool_],
-    instance: NDArray[np.uint32],
+    free: BoolArray,
+    instance: Uint32Array,
 ) -> None:
     """Give voxels without an actor the most frequent number of the static points in them."""
     if "instances" not in feed.sequence.fields():
@@ -172,8 +177,8 @@ def _number_boxes(
     feed: ScanFeed,
     actors: MovingActors,
     now: Instant,
-    free: NDArray[np.bool_],
-    instance: NDArray[np.uint32],
+    free: BoolArray,
+    instance: Uint32Array,
 ) -> None:
     """Give voxels without an actor the number of the smallest box that contains them."""
     boxes = feed.sequence.boxes(now.frame) if "boxes" in feed.sequence.fields() else None

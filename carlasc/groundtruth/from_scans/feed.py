@@ -15,8 +15,8 @@ from typing import Any
 from uuid import uuid4
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, BoolArray, Float32Array, IntArray, LabelArray, Uint32Array
 from carlasc.core.geometry import Transform, thin
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan, check_finite, lengths, sorted_by_origin
@@ -91,14 +91,14 @@ class WithoutScans(SequenceView):
         super().__init__(whole)
         self.hidden = frozenset(hidden)
 
-    def frames(self, field: str) -> NDArray[np.int64]:
+    def frames(self, field: str) -> IntArray:
         """Return the frames of a field, without hidden ones if it is a field of the scans."""
         frames = self.whole.frames(field)
         return (
             frames[~np.isin(frames, sorted(self.hidden))] if field in layout.SCAN_FIELDS else frames
         )
 
-    def read(self, field: str, frame: int) -> NDArray[Any]:
+    def read(self, field: str, frame: int) -> AnyArray:
         """Read one field of one frame; no rows if the frame is hidden."""
         if frame not in self.hidden or field not in layout.SCAN_FIELDS:
             return self.whole.read(field, frame)
@@ -161,7 +161,7 @@ class ScanFeed:
         return scans_digest(self.sequence, self.frames)
 
     @cached_property
-    def frames(self) -> NDArray[np.int64]:
+    def frames(self) -> IntArray:
         """The sequence's frames with points, sorted."""
         return self.sequence.frames("points")
 
@@ -294,7 +294,7 @@ class ScanFeed:
             <= across + self.read(other).reach_m
         ]
 
-    def _by_distance(self, frame: int, others: NDArray[np.int64]) -> Iterator[int]:
+    def _by_distance(self, frame: int, others: IntArray) -> Iterator[int]:
         """Yield the frames of `others` within `window_m` that are not too close to each other, in
         order of distance from `frame`.
         """
@@ -363,7 +363,7 @@ class ScanFeed:
             self._scans.move_to_end(frame)
             return self._scans[frame]
 
-    def static_points(self, frame: int) -> NDArray[np.float32]:
+    def static_points(self, frame: int) -> Float32Array:
         """Return the (N, 3) points of a scan of classes that cannot move, metres, sensor frame; all
         points without labels.
         """
@@ -451,7 +451,7 @@ class ScanFeed:
         order = sorted_by_origin(origins)
         return scan.select(order[voting[order]])
 
-    def _in_range(self, scan: Scan) -> NDArray[np.bool_]:
+    def _in_range(self, scan: Scan) -> BoolArray:
         """Return (N,) bool: which points are finite, and neither too near to the origins of their
         rays nor too far.
         """
@@ -460,9 +460,7 @@ class ScanFeed:
             distance = lengths(scan.points if origins is None else scan.points - origins)
             return (distance >= self.min_range_m) & (distance <= self.max_range_m)
 
-    def _with_ground(
-        self, points: NDArray[np.float32], labels: NDArray[np.unsignedinteger]
-    ) -> NDArray[np.uint32]:
+    def _with_ground(self, points: Float32Array, labels: LabelArray) -> Uint32Array:
         """Return labels in which points without a class on the ground have a ground class, so that
         they vote as ground.
         """
@@ -486,7 +484,7 @@ def _restore(key: str, sequence: Sequence, options: FromScans) -> ScanFeed:
     return feed
 
 
-def _labels(scan: Scan) -> NDArray[np.unsignedinteger]:
+def _labels(scan: Scan) -> LabelArray:
     if scan.labels is None:
         raise FormatError("scan", expected="labels", found="none")
     return scan.labels

@@ -6,11 +6,19 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from itertools import chain
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import (
+    AnyArray,
+    AnyIntArray,
+    BoolArray,
+    Float32Array,
+    IntArray,
+    LabelArray,
+    Uint8Array,
+)
 from carlasc.core.cells import count_points
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
@@ -114,7 +122,7 @@ def merge_frame(
         completing.append(merger.in_bodies(now, window, bodies, mirror=True))
         if options.complete == "body":
             completing.append(merger.shells(now, bodies))
-    completed = list[tuple[NDArray[np.int64], NDArray[Any]]]()
+    completed = list[tuple[IntArray, AnyArray]]()
     for observations in completing:
         completions = steps.vote(observations).votes(copy=False)
         completed.append(steps.complete(made, completions))
@@ -146,9 +154,9 @@ def merge_frame(
 def _join_shares(
     votes: Votes,
     consensus: ClassConsensus | None,
-    completed: list[tuple[NDArray[np.int64], NDArray[Any]]],
+    completed: list[tuple[IntArray, AnyArray]],
     classes: ClassTable,
-) -> NDArray[Any]:
+) -> AnyArray:
     """Return the shares of classes: from the consensus of scans, and for completed voxels from the
     votes that completed them.
     """
@@ -159,9 +167,7 @@ def _join_shares(
     return joined[np.argsort(joined["voxel"], kind="stable")]
 
 
-def _have_neighbours(
-    voxels: NDArray[np.int64], others: NDArray[np.int64], spec: GridSpec
-) -> NDArray[np.bool_]:
+def _have_neighbours(voxels: IntArray, others: IntArray, spec: GridSpec) -> BoolArray:
     """Return which of (N,) voxels, flat indices, have one of (M,) other voxels, increasing, among
     the 26 around them.
     """
@@ -187,18 +193,18 @@ class _VoxelEvidence:
         matter: (N,) kind of matter: see `Matter`.
     """
 
-    voxels: NDArray[np.int64]
-    labels: NDArray[np.unsignedinteger]
-    hits: NDArray[np.integer]
-    free: NDArray[np.integer]
+    voxels: IntArray
+    labels: LabelArray
+    hits: AnyIntArray
+    free: AnyIntArray
     matter: NDArray[np.int8]
 
     @property
-    def counts(self) -> NDArray[np.integer]:
+    def counts(self) -> AnyIntArray:
         """(N,) hits and free samples."""
         return self.hits + self.free
 
-    def at(self, chosen: NDArray[np.bool_]) -> _VoxelEvidence:
+    def at(self, chosen: BoolArray) -> _VoxelEvidence:
         """Return the evidence of some of the voxels."""
         return _VoxelEvidence(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
@@ -214,19 +220,17 @@ class _UnfinishedGrid:
         passed: (P,) flat indices of unknown voxels whose mirror images rays passed through.
     """
 
-    labels: NDArray[np.unsignedinteger]
-    counts: NDArray[np.unsignedinteger]
-    occupied: NDArray[np.float32] | None = None
-    passed: NDArray[np.int64] = field(default_factory=lambda: _NO_VOXELS)
+    labels: LabelArray
+    counts: LabelArray
+    occupied: Float32Array | None = None
+    passed: IntArray = field(default_factory=lambda: _NO_VOXELS)
 
-    def forget(self, voxels: NDArray[np.integer]) -> None:
+    def forget(self, voxels: AnyIntArray) -> None:
         """Make voxels unknown."""
         self.labels[voxels] = self.counts[voxels] = 0
         self.set_probability(voxels, UNKNOWN)
 
-    def set_probability(
-        self, voxels: NDArray[np.integer], probability: NDArray[np.float32] | float
-    ) -> None:
+    def set_probability(self, voxels: AnyIntArray, probability: Float32Array | float) -> None:
         """Set the probability that voxels are occupied, if it is needed."""
         if self.occupied is not None:
             self.occupied[voxels] = probability
@@ -244,7 +248,7 @@ class _FrameSteps:
     regions: BodyRegions
 
     @cached_property
-    def in_body(self) -> NDArray[np.bool_]:
+    def in_body(self) -> BoolArray:
         """(V,) bool: the voxels of bodies."""
         return self.regions.of_voxel != STATIC
 
@@ -272,7 +276,7 @@ class _FrameSteps:
         made.forget(doubtful)
         return made
 
-    def _doubtful(self, evidence: _VoxelEvidence) -> NDArray[np.int64]:
+    def _doubtful(self, evidence: _VoxelEvidence) -> IntArray:
         """Return the voxels of bodies with an uncertain decision: free ones that may be occupied,
         and actors that may be free.
         """
@@ -282,9 +286,7 @@ class _FrameSteps:
         )
         return evidence.voxels[(evidence.counts > 0) & unsure]
 
-    def complete(
-        self, made: _UnfinishedGrid, votes: Votes
-    ) -> tuple[NDArray[np.int64], NDArray[Any]]:
+    def complete(self, made: _UnfinishedGrid, votes: Votes) -> tuple[IntArray, AnyArray]:
         """Complete unknown voxels of bodies by votes; return these voxels and their votes.
 
         Voxels with free votes stay unknown.
@@ -306,7 +308,7 @@ class _FrameSteps:
         made.set_probability(inferred.voxels, self._probability(inferred))
         return inferred.voxels, votes.occupied[np.isin(votes.occupied["voxel"], inferred.voxels)]
 
-    def actors(self, labels: NDArray[np.integer]) -> VoxelActors | None:
+    def actors(self, labels: AnyIntArray) -> VoxelActors | None:
         """Return the actors in the voxels of (V,) classes; None unless the plan needs them."""
         if not self.plan.voting.keep_actors:
             return None
@@ -315,7 +317,7 @@ class _FrameSteps:
             self.plan.spec, self.feed, merger.actors, self.now, self.regions, self.window, labels
         )
 
-    def flags(self, inferred: NDArray[np.int64], contested: NDArray[np.int64]) -> NDArray[np.uint8]:
+    def flags(self, inferred: IntArray, contested: IntArray) -> Uint8Array:
         """Return (V,) uint8: the flags of each voxel."""
         own = [self.now.frame] if self.now.frame in self.window else []
         now = self.vote(self.merger.observations(self.now, own))
@@ -352,14 +354,14 @@ class _FrameSteps:
         return ballot
 
     def _evidence(
-        self, votes: Votes, labels: NDArray[Any], hits: NDArray[Any], voxels: NDArray[np.int64]
+        self, votes: Votes, labels: AnyArray, hits: AnyArray, voxels: IntArray
     ) -> _VoxelEvidence:
         """Return the evidence of some voxels; `labels`, `hits`: from `Votes.elect_occupied`."""
         labels = labels[voxels]
         matter = matter_of(labels, self.in_body[voxels], self.feed.classes)
         return _VoxelEvidence(voxels, labels, hits[voxels], votes.free.reshape(-1)[voxels], matter)
 
-    def _decide(self, evidence: _VoxelEvidence) -> NDArray[np.unsignedinteger]:
+    def _decide(self, evidence: _VoxelEvidence) -> LabelArray:
         if self.feed.options.dynamic == "tube":
             return evidence.labels
         free_m = evidence.free * self.plan.voting.free_step_m
@@ -367,7 +369,7 @@ class _FrameSteps:
             is_occupied(evidence.hits, free_m, evidence.matter), evidence.labels, 0
         ).astype(evidence.labels.dtype)
 
-    def _probability(self, evidence: _VoxelEvidence) -> NDArray[np.float32]:
+    def _probability(self, evidence: _VoxelEvidence) -> Float32Array:
         step = self.plan.voting.free_step_m
         return probability(
             evidence.hits,
@@ -378,14 +380,14 @@ class _FrameSteps:
             step,
         )
 
-    def contested(self) -> NDArray[np.int64]:
+    def contested(self) -> IntArray:
         """Return the voxels outside of bodies that moving points are in at other times."""
         if self.feed.options.dynamic != "align":
             return _NO_VOXELS
         others = [other for other in self.window if other != self.now.frame]
         return np.flatnonzero(self.vote(self.merger.moving(self.now, others)).hit & ~self.in_body)
 
-    def unseen_now(self, voxels: NDArray[np.int64], recent: list[int]) -> NDArray[np.int64]:
+    def unseen_now(self, voxels: IntArray, recent: list[int]) -> IntArray:
         """Return the voxels of `voxels` in which recent scans have no moving points."""
         return (
             voxels[~self.vote(self.merger.moving(self.now, recent)).hit[voxels]]
@@ -420,7 +422,7 @@ class _FrameSteps:
         made.labels[kept], made.counts[kept] = consensus.labels[kept], (hits + free)[is_kept]
         made.set_probability(kept, _RETURNED_PROBABILITY)
 
-    def driven(self, made: _UnfinishedGrid) -> NDArray[np.int64]:
+    def driven(self, made: _UnfinishedGrid) -> IntArray:
         """Return the occupied voxels on the ego path of other frames, without ground, bodies and
         returns of the frame's own scan.
         """

@@ -17,6 +17,17 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import (
+    AnyFloatArray,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    Int32Array,
+    IntArray,
+    LabelArray,
+    Uint8Array,
+    Uint16Array,
+)
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import GridSpec
@@ -82,28 +93,28 @@ class PreparedScan:
     """
 
     frame: int
-    points: NDArray[np.float32]
-    labels: NDArray[np.uint16]
+    points: Float32Array
+    labels: Uint16Array
     world_T_sensor: Transform
     reach_m: float
     seconds: float
-    moving: NDArray[np.int64]
-    ends: NDArray[np.float32]
+    moving: IntArray
+    ends: Float32Array
     rays: tuple[RaysFromPlace, ...]
-    sure: NDArray[np.float32] | None = None
+    sure: Float32Array | None = None
 
     @classmethod
     def of(
         cls,
         frame: int,
-        points: NDArray[np.float32],
-        labels: NDArray[np.unsignedinteger],
+        points: Float32Array,
+        labels: LabelArray,
         world_T_sensor: Transform,
         *,
         seconds: float = 0.0,
-        moving: NDArray[np.int64] | None = None,
-        origins: NDArray[np.float32] | None = None,
-        probabilities: NDArray[np.uint16] | None = None,
+        moving: IntArray | None = None,
+        origins: Float32Array | None = None,
+        probabilities: Uint16Array | None = None,
     ) -> PreparedScan:
         """Prepare the voting points of a scan.
 
@@ -145,7 +156,7 @@ class PreparedScan:
         )
 
     @cached_property
-    def world_T_places(self) -> NDArray[np.float64]:
+    def world_T_places(self) -> FloatArray:
         """(4, 4) pose of the sensor, or (K, 4, 4) poses of the origins of rays."""
         places = np.stack([rays.sensor_T_place for rays in self.rays])
         return (
@@ -155,7 +166,7 @@ class PreparedScan:
         )
 
     @cached_property
-    def enough(self) -> tuple[NDArray[np.intp], NDArray[np.uint8]]:
+    def enough(self) -> tuple[NDArray[np.intp], Uint8Array]:
         """(M,) indices of the rays that vote with `rays="enough"`, and their (M,) weights: near the
         sensor, one of up to four votes for all.
 
@@ -172,9 +183,7 @@ class PreparedScan:
         chosen = np.flatnonzero(turn <= np.uint32(2**32 - 1) >> power)
         return chosen, np.left_shift(1, power[chosen]).astype(np.uint8)
 
-    def votes_of(
-        self, labels: NDArray[np.uint16], hits: NDArray[np.bool_] | None
-    ) -> dict[str, Any]:
+    def votes_of(self, labels: Uint16Array, hits: BoolArray | None) -> dict[str, Any]:
         """Return arguments of `Observation` for the votes of the scan: all except poses and
         regions.
 
@@ -196,8 +205,8 @@ class PreparedScan:
         }
 
     def through(
-        self, world_T_box: Transform, lower: NDArray[np.float64], upper: NDArray[np.float64]
-    ) -> Iterator[tuple[RaysFromPlace, Transform, NDArray[np.int32]]]:
+        self, world_T_box: Transform, lower: FloatArray, upper: FloatArray
+    ) -> Iterator[tuple[RaysFromPlace, Transform, Int32Array]]:
         """Yield the rays from each origin, (4, 4) box_T_place, and the indices of its rays that
         intersect a box.
 
@@ -230,11 +239,11 @@ class Merger:
     ) -> None:
         self.scan_of, self.actors, self.classes, self.dynamic = scan_of, actors, classes, dynamic
         self.rays: Rays = "all"
-        self._static: dict[int, NDArray[np.bool_]] = {}
-        self._labels: dict[int, NDArray[np.uint16]] = {}
+        self._static: dict[int, BoolArray] = {}
+        self._labels: dict[int, Uint16Array] = {}
         self._carried: dict[tuple[int, int], tuple[Observation, ...]] = {}
         self._sampled: dict[int, dict[str, Any]] = {}
-        self._moving: dict[int, tuple[NDArray[np.float32], NDArray[np.uint16]]] = {}
+        self._moving: dict[int, tuple[Float32Array, Uint16Array]] = {}
 
     def forget_before(self, frame: int) -> None:
         """Clear the caches of scans before a frame."""
@@ -265,7 +274,7 @@ class Merger:
             places = grid_T_world @ scan.world_T_places
             yield Observation(grid_T_sensor=places, free_region=None if own else STATIC, **votes)
 
-    def _enough(self, scan: PreparedScan, hits: NDArray[np.bool_] | None) -> dict[str, Any]:
+    def _enough(self, scan: PreparedScan, hits: BoolArray | None) -> dict[str, Any]:
         """Return the votes of the rays that are enough: prepared once, for all frames that use
         them.
         """
@@ -359,7 +368,7 @@ class Merger:
                     points, labels, now.grid_T_world @ pose, hit_region=region, free_region=NOWHERE
                 )
 
-    def static(self, frame: int) -> NDArray[np.bool_]:
+    def static(self, frame: int) -> BoolArray:
         """Return (N,) bool: the points of a scan that belong to no moving actor.
 
         Points in or near the body of an actor are not static, except ground: fields and free space
@@ -381,7 +390,7 @@ class Merger:
             self._static[frame] = static
         return self._static[frame]
 
-    def labels(self, frame: int) -> NDArray[np.uint16]:
+    def labels(self, frame: int) -> Uint16Array:
         """Return the (N,) classes of the points of a scan.
 
         All points of an actor have the most frequent class of its points in all scans.
@@ -412,7 +421,7 @@ class Merger:
         return self._carried.setdefault((number, other), tuple(through))
 
 
-def _points_near(track: Track, scan: PreparedScan) -> NDArray[np.int64]:
+def _points_near(track: Track, scan: PreparedScan) -> IntArray:
     """Return the indices of the points of a scan that are in the body of an actor, or within
     `_AROUND_M` of it.
     """
@@ -438,10 +447,10 @@ class BodyRegions:
         hidden_ends: (E,) the same for faces that are hidden also in the mirror image of the body.
     """
 
-    of_voxel: NDArray[np.uint16]
+    of_voxel: Uint16Array
     actors: Mapping[int, int]
-    hidden: NDArray[np.int64]
-    hidden_ends: NDArray[np.int64]
+    hidden: IntArray
+    hidden_ends: IntArray
 
     @classmethod
     def at(
@@ -471,7 +480,7 @@ class BodyRegions:
             )
         return regions
 
-    def with_points(self, spec: GridSpec, points: NDArray[np.floating]) -> BodyRegions:
+    def with_points(self, spec: GridSpec, points: AnyFloatArray) -> BodyRegions:
         """Return the regions with another one for the voxels of moving points without a body.
 
         Only the frame's own rays vote there.
@@ -551,10 +560,10 @@ class BodyRegions:
 
 def _on_hidden_face(
     track: Track,
-    cells: NDArray[np.float64],
-    slack: NDArray[np.float64],
+    cells: FloatArray,
+    slack: FloatArray,
     faces: tuple[bool, bool, bool, bool],
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Return (C,) bool: which cells touch an unseen face and no seen face of an actor.
 
     Args:

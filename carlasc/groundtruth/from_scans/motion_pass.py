@@ -16,8 +16,8 @@ from itertools import chain, islice
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyIntArray, FloatArray, IntArray
 from carlasc.core.geometry import invert, multiply, thin, transform_points
 from carlasc.errors import CarlascError
 from carlasc.groundtruth.from_scans.feed import ScanFeed
@@ -155,7 +155,7 @@ class _MotionPass:
 
     def found(
         self, boxes: tuple[Track, ...]
-    ) -> tuple[list[Track], dict[int, NDArray[np.integer]], list[NDArray[np.float64]]]:
+    ) -> tuple[list[Track], dict[int, AnyIntArray], list[FloatArray]]:
         """Return the tracks of found actors, and `moving` and `own` of `MovingActors`."""
         frames = list(self.feed.times)
         # A block reads the seconds around it too: longer blocks repeat less, and shorter ones keep
@@ -173,8 +173,8 @@ class _MotionPass:
 
         classes = self.feed.classes
         label = 0 if self.feed.has_labels else classes.geometry_id
-        moved: dict[int, NDArray[np.int64]] = {}
-        own: list[NDArray[np.float64]] = []
+        moved: dict[int, IntArray] = {}
+        own: list[FloatArray] = []
         actors = follow_actors(
             evidence(),
             moved,
@@ -219,19 +219,17 @@ def find_actors(
     boxes = _box_tracks(feed)
     moving_boxes = tuple(track for track in boxes if track.moves)
     tracks = by.boxed(boxes, moving_boxes) if boxes else by.linked()
-    moving: dict[int, NDArray[np.integer]] = {}
-    own: list[NDArray[np.float64]] = []
+    moving: dict[int, AnyIntArray] = {}
+    own: list[FloatArray] = []
     if "evidence" in feed.motion:
         found, moving, own = by.found(moving_boxes)
         tracks += found
     return MovingActors.of(tracks if boxes else complete_bodies(tracks), moving, own)
 
 
-def _untracked(
-    moved: dict[int, NDArray[np.int64]], tracks: list[Track]
-) -> dict[int, NDArray[np.integer]]:
+def _untracked(moved: dict[int, IntArray], tracks: list[Track]) -> dict[int, AnyIntArray]:
     """Return the moved points of each frame that belong to no track."""
-    tracked: dict[int, list[NDArray[np.integer]]] = {}
+    tracked: dict[int, list[AnyIntArray]] = {}
     for track in tracks:
         for frame, members in track.members.items():
             tracked.setdefault(frame, []).append(members)
@@ -354,7 +352,7 @@ def _key_of(name: str, feed: ScanFeed, **settings: Any) -> str:
 
 
 def with_refined_poses(
-    sequence: StoredScans, frames: NDArray[np.int64], refined: RefinedPoses
+    sequence: StoredScans, frames: IntArray, refined: RefinedPoses
 ) -> StoredScans:
     """Return a sequence with refined poses.
 
@@ -373,7 +371,7 @@ def with_refined_poses(
     return sequence.with_poses(poses)
 
 
-def pose_notes(refined: RefinedPoses, frames: NDArray[np.int64]) -> Iterator[str]:
+def pose_notes(refined: RefinedPoses, frames: IntArray) -> Iterator[str]:
     """Yield a line on the result of the refinement; none if the given poses are good."""
     before, after = (f"{100 * (value or 0.0):.1f} cm" for value in refined.disagreements_m)
     left = ", ".join(f"{a} to {b}" for a, b in refined.left(frames)[:3])

@@ -12,8 +12,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.geometry import check_rigid, transform_points
 from carlasc.core.grids import Grid
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
@@ -255,7 +255,7 @@ class ScanSequence(StoredSequence):
             name: value for name, value in limits.items() if np.isfinite(value) and value > 0
         }
 
-    def poses(self) -> NDArray[np.float64] | None:
+    def poses(self) -> FloatArray | None:
         """Return the poses to write beside the grids; None if poses were estimated although the
         sequence has its own.
         """
@@ -436,7 +436,7 @@ def check_trajectory(sequence: Sequence, options: FromScans) -> None:
         _check_speed(sequence, frames, where)
 
 
-def _check_speed(sequence: Sequence, frames: NDArray[np.int64], where: str) -> None:
+def _check_speed(sequence: Sequence, frames: IntArray, where: str) -> None:
     poses = np.stack([sequence.read_pose(int(frame)) for frame in frames])
     # Speeds, not distances: frames may be missing, and then the distance is longer.
     elapsed_s = np.diff(sequence.times_of(frames))
@@ -458,7 +458,7 @@ def _check_speed(sequence: Sequence, frames: NDArray[np.int64], where: str) -> N
         )
 
 
-def _check_times(sequence: Sequence, frames: NDArray[np.int64]) -> None:
+def _check_times(sequence: Sequence, frames: IntArray) -> None:
     if layout.TIMES not in sequence.documents():
         return
     times = np.array([sequence.read_time(int(frame)) for frame in frames])

@@ -19,12 +19,13 @@ import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 from numpy.lib.recfunctions import structured_to_unstructured
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, AnyIntArray, BoolArray
 from carlasc.core.classes import ClassTable
 from carlasc.errors import ArgumentError, import_extra
 from carlasc.storage.files import write_output
@@ -62,11 +63,11 @@ class PointPieces:
     """
 
     count: int
-    pieces: Callable[[], Iterator[NDArray[Any]]]
+    pieces: Callable[[], Iterator[AnyArray]]
     classes: ClassTable
     about: str
 
-    def colored(self) -> Iterator[NDArray[Any]]:
+    def colored(self) -> Iterator[AnyArray]:
         """Yield the pieces with the colours of their classes."""
         for piece in self.pieces():
             rows = np.zeros(len(piece), _ROW_DTYPE)
@@ -188,8 +189,8 @@ _ALL_FREE, _ALL_OCCUPIED = 0x5555, 0xAAAA  # eight equal children, which become 
 
 def write_octomap(
     path: str | os.PathLike[str],
-    cells: NDArray[np.integer],
-    occupied: NDArray[np.bool_],
+    cells: AnyIntArray,
+    occupied: BoolArray,
     cell_m: float,
 ) -> None:
     """Write cells as an OctoMap binary tree.
@@ -218,7 +219,7 @@ def write_octomap(
     write_output(Path(path), text.encode() + tree)
 
 
-def _encode(cells: NDArray[np.integer], occupied: NDArray[np.bool_]) -> tuple[int, bytes]:
+def _encode(cells: AnyIntArray, occupied: BoolArray) -> tuple[int, bytes]:
     """Return the number of nodes of a tree, and its encoded bytes."""
     code = _interleave((cells + _MIDDLE).astype(np.uint64))
     order = np.argsort(code)

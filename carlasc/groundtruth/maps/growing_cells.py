@@ -11,11 +11,10 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, IntArray, LabelArray
 from carlasc.groundtruth.maps.cloud_files import POINT_DTYPE
 
 Part = tuple[int, int, int]
@@ -48,12 +47,12 @@ _MOST_ROWS = 4_000_000  # in memory: 200 MB
 
 
 def rows_of_scan(
-    points: NDArray[np.float64],
-    labels: NDArray[np.unsignedinteger],
-    sure: NDArray[np.float32] | None,
-    groups: NDArray[np.int64],
+    points: FloatArray,
+    labels: LabelArray,
+    sure: Float32Array | None,
+    groups: IntArray,
     cell_m: float,
-) -> tuple[NDArray[np.int64], NDArray[Any]]:
+) -> tuple[IntArray, AnyArray]:
     """Return the cells in which a scan has points.
 
     Args:
@@ -107,7 +106,7 @@ def rows_of_scan(
     return np.column_stack([groups[order[begins]], tile]), rows
 
 
-def split(parts: NDArray[np.int64], rows: NDArray[Any]) -> list[tuple[Part, NDArray[Any]]]:
+def split(parts: IntArray, rows: AnyArray) -> list[tuple[Part, AnyArray]]:
     """Return the rows of each part, in order; rows of the same cell and class are summed."""
     order = np.lexsort((rows["key"], *parts.T[::-1]))
     parts, rows = parts[order], rows[order]
@@ -119,7 +118,7 @@ def split(parts: NDArray[np.int64], rows: NDArray[Any]) -> list[tuple[Part, NDAr
     return [(place, _added([piece])) for place, piece in zip(places, pieces, strict=True)]
 
 
-def _added(pieces: Iterable[NDArray[Any]]) -> NDArray[Any]:
+def _added(pieces: Iterable[AnyArray]) -> AnyArray:
     """Return rows in order of their keys; rows with the same key are summed."""
     rows = np.concatenate(list(pieces))
     rows = rows[np.argsort(rows["key"], kind="stable")]
@@ -142,11 +141,11 @@ class GrowingCells:
     def __init__(self, folder: Path, cell_m: float, most_rows: int = _MOST_ROWS) -> None:
         self.folder, self.cell_m, self.most_rows = folder, cell_m, most_rows
         self.counts: dict[Part, int] = {}
-        self._rows: OrderedDict[Part, list[NDArray[Any]]] = OrderedDict()
+        self._rows: OrderedDict[Part, list[AnyArray]] = OrderedDict()
         self._held = 0
         self._stored: set[Part] = set()
 
-    def add(self, pieces: Iterable[tuple[Part, NDArray[Any]]]) -> None:
+    def add(self, pieces: Iterable[tuple[Part, AnyArray]]) -> None:
         """Add the cells of some scans: see `split`."""
         for part, rows in pieces:
             self._rows.setdefault(part, []).append(rows)
@@ -164,7 +163,7 @@ class GrowingCells:
     def _path(self, part: Part) -> Path:
         return self.folder / f"{'_'.join(map(str, part))}.npy"
 
-    def _whole(self, part: Part, rows: list[NDArray[Any]]) -> NDArray[Any]:
+    def _whole(self, part: Part, rows: list[AnyArray]) -> AnyArray:
         return _added([np.load(self._path(part)), *rows] if part in self._stored else rows)
 
     def finish(self) -> None:
@@ -177,7 +176,7 @@ class GrowingCells:
             self.counts[part] = len(points)
             np.save(self._path(part), points)
 
-    def _elect(self, part: Part, rows: NDArray[Any]) -> NDArray[Any]:
+    def _elect(self, part: Part, rows: AnyArray) -> AnyArray:
         """Return one point per cell: the mean of its points, with the class with most votes, the
         lowest of several.
         """
@@ -197,14 +196,14 @@ class GrowingCells:
         points["confidence"] = rows["votes"][best] / _VOTE / (points["seen"] + 1.0)
         return points
 
-    def points(self, group: int = STATIC) -> Iterator[NDArray[Any]]:
+    def points(self, group: int = STATIC) -> Iterator[AnyArray]:
         """Yield the points of a group, tile by tile, after `finish`."""
         for part in self.counts:
             if part[0] == group:
                 yield np.load(self._path(part))
 
 
-def _indices(part: Part, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+def _indices(part: Part, cells: IntArray) -> IntArray:
     """Return the (N, 3) indices of cells of a part, from keys without their class."""
     column = cells >> _HEIGHT_BITS
     x, y = column >> _SIDE_BITS, column & (_SIDE - 1)
@@ -212,7 +211,7 @@ def _indices(part: Part, cells: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.stack([x + part[1] * _SIDE, y + part[2] * _SIDE, z], axis=1)
 
 
-def cells_of(points: NDArray[Any], cell_m: float) -> NDArray[np.int64]:
+def cells_of(points: AnyArray, cell_m: float) -> IntArray:
     """Return (N, 3) indices of the cells of points of a map, (N,) `POINT_DTYPE`."""
     return np.stack(
         [np.floor(points[axis].astype(np.float64) / cell_m) for axis in "xyz"], axis=1

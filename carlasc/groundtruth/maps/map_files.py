@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyIntArray, FloatArray, IntArray, Uint16Array
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid
 from carlasc.errors import ArgumentError, ConflictError, import_extra
@@ -46,10 +46,10 @@ class MapCells:
         size: (3,) size of a cell, metres.
     """
 
-    index: NDArray[np.int64]
-    labels: NDArray[np.integer]
-    lower: NDArray[np.float64]
-    size: NDArray[np.float64]
+    index: IntArray
+    labels: AnyIntArray
+    lower: FloatArray
+    size: FloatArray
 
     def write_octomap(self, path: Path) -> None:
         """Write the cells as a tree of OctoMap.
@@ -202,17 +202,17 @@ class SurfaceMesh:
         labels: (V,) class of each vertex, from its occupied cell.
     """
 
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
-    labels: NDArray[np.int64]
+    vertices: FloatArray
+    faces: IntArray
+    labels: IntArray
 
     @classmethod
     def of(
         cls,
-        cells: NDArray[np.int64],
-        labels: NDArray[np.integer],
-        lower: NDArray[np.float64],
-        size: NDArray[np.float64],
+        cells: IntArray,
+        labels: AnyIntArray,
+        lower: FloatArray,
+        size: FloatArray,
     ) -> SurfaceMesh:
         """Mesh cells by marching cubes.
 
@@ -265,9 +265,7 @@ class SurfaceMesh:
         write_output(Path(path), mesh.export(file_type=kind[1:]))
 
 
-def _blocks(
-    cells: NDArray[np.int64], labels: NDArray[np.integer]
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint16]]]:
+def _blocks(cells: IntArray, labels: AnyIntArray) -> Iterator[tuple[IntArray, Uint16Array]]:
     """Yield the first cell of each block, and the classes of its cells with a border of one cell, 0
     where free.
 
@@ -291,8 +289,8 @@ def _blocks(
 
 
 def _march(
-    volume: NDArray[np.uint16],
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    volume: Uint16Array,
+) -> tuple[IntArray, IntArray, IntArray]:
     """Return the positions of the vertices in 1 / `_STEPS` of a cell, the triangles, and the
     classes of the vertices.
     """

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, FloatArray, IntArray
 from carlasc.core.axes import mirror_poses, mirror_voxels
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.geometry import invert, transform_points
@@ -303,16 +303,14 @@ class _AddScans:
     cell_m: float
     actors: bool
 
-    def __call__(
-        self, block: tuple[tuple[int, ...], MovingActors]
-    ) -> list[tuple[Part, NDArray[Any]]]:
+    def __call__(self, block: tuple[tuple[int, ...], MovingActors]) -> list[tuple[Part, AnyArray]]:
         frames, actors = block
         merger = Merger(self.feed.read, actors, self.feed.classes, "align")
         of_scans = [rows for frame in frames for rows in self._rows(merger, frame)]
         parts, rows = zip(*of_scans, strict=True)
         return split(np.concatenate(parts), np.concatenate(rows))
 
-    def _rows(self, merger: Merger, frame: int) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
+    def _rows(self, merger: Merger, frame: int) -> Iterator[tuple[IntArray, AnyArray]]:
         """Yield the cells of the static points of a scan, then, if `actors` is set, those of each
         actor.
         """
@@ -321,7 +319,7 @@ class _AddScans:
         if feed.must_find_ground:  # ground that was found had a class for the votes only
             labels[np.isin(labels, sorted(feed.classes.ground))] = feed.classes.geometry_id
         world = transform_points(scan.world_T_sensor, scan.points.astype(np.float64))
-        chosen: list[tuple[int, NDArray[Any], NDArray[np.float64]]] = [
+        chosen: list[tuple[int, AnyArray, FloatArray]] = [
             (STATIC, np.flatnonzero(static), world[static])
         ]
         for number, track in merger.actors.tracks.items() if self.actors else ():

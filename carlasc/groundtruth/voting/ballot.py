@@ -11,11 +11,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import (
+    AnyArray,
+    BoolArray,
+    Float32Array,
+    IntArray,
+    LabelArray,
+    Uint8Array,
+    Uint16Array,
+)
 from carlasc.core.choices import VoteRule as VoteRule  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, check_rigid
@@ -70,15 +78,15 @@ class Observation:
             transform is not rigid.
     """
 
-    points: NDArray[np.float32]
-    labels: NDArray[np.unsignedinteger]
+    points: Float32Array
+    labels: LabelArray
     grid_T_sensor: Transform
-    hits: NDArray[np.bool_] | None = None
+    hits: BoolArray | None = None
     hit_region: int | None = None
     free_region: int | None = None
-    sure: NDArray[np.float32] | None = None
-    ends: NDArray[np.int64] | None = None
-    weights: NDArray[np.uint8] | None = None
+    sure: Float32Array | None = None
+    ends: IntArray | None = None
+    weights: Uint8Array | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype != np.float32:
@@ -188,7 +196,7 @@ class Ballot:
         *,
         rule: VoteRule = "sensor",
         free_step_m: float = 1.5,
-        regions: NDArray[np.uint16] | None = None,
+        regions: Uint16Array | None = None,
         count_views: bool = False,
         keep_boxes: bool = False,
     ) -> None:
@@ -212,7 +220,7 @@ class Ballot:
         # The arrays of free space have one element more than there are voxels: samples outside of
         # the grid count there, so that the inner loop needs no branch.
         viewed = spec.num_voxels + 1 if count_views else 0
-        self._cells, self._outside = Cells.of(spec), dict[int, NDArray[np.int64]]()
+        self._cells, self._outside = Cells.of(spec), dict[int, IntArray]()
         self._boxes = filled.no_boxes(spec.num_voxels) if keep_boxes else None
         self._tally = kernel.Tally(
             once,
@@ -280,7 +288,7 @@ class Ballot:
         # Each origin of rays is a voter, with a number of its own: `once` compares these numbers.
         self.num_observations += len(ends)
 
-    def _apart(self, region: int) -> NDArray[np.int64]:
+    def _apart(self, region: int) -> IntArray:
         """Return the voxels outside of a region, if they are few and each sample counts; otherwise
         none.
         """
@@ -293,7 +301,7 @@ class Ballot:
         return self._outside[region]
 
     @property
-    def views(self) -> NDArray[np.uint16]:
+    def views(self) -> Uint16Array:
         """(X, Y, Z) uint16: number of observations that saw each voxel; a copy.
 
         Only with `count_views`.
@@ -301,13 +309,13 @@ class Ballot:
         return self._tally.views[:-1].reshape(self.spec.size).copy()
 
     @property
-    def hit(self) -> NDArray[np.bool_]:
+    def hit(self) -> BoolArray:
         """(V,) bool: voxels with votes for a class other than free space."""
         from carlasc.groundtruth.voting import kernel
 
         return self._tally.heads != kernel.NONE
 
-    def seen(self) -> NDArray[np.bool_]:
+    def seen(self) -> BoolArray:
         """Return (V,) bool: which voxels have votes."""
         return self.hit | (self._tally.free[:-1] > 0)
 
@@ -341,7 +349,7 @@ class Ballot:
             self._tally = self._tally._replace(candidates=grown)
 
 
-def _ready(values: NDArray[Any] | None, dtype: type[np.generic]) -> NDArray[Any]:
+def _ready(values: AnyArray | None, dtype: type[np.generic]) -> AnyArray:
     """Return an array as the compiled loops take it; empty for None.
 
     Numba compiles a loop again for each layout of its arrays, read-only ones too.
@@ -367,9 +375,9 @@ class Votes:
 
     spec: GridSpec
     classes: ClassTable
-    free: NDArray[Any]
-    occupied: NDArray[Any]
-    boxes: NDArray[np.uint8] | None = None
+    free: AnyArray
+    occupied: AnyArray
+    boxes: Uint8Array | None = None
 
     def to_grid(self) -> Grid:
         """Return the grid: the class with most votes in each voxel, which may be free space, and
@@ -378,13 +386,13 @@ class Votes:
         labels, counts = self._elect(self.free.reshape(-1).copy())
         return Grid(self.spec, labels.reshape(self.spec.size), counts.reshape(self.spec.size))
 
-    def elect_occupied(self) -> tuple[NDArray[Any], NDArray[Any]]:
+    def elect_occupied(self) -> tuple[AnyArray, AnyArray]:
         """Return the (V,) classes with most votes, without free space, and the (V,) sums of the
         votes without free space; 0 without any.
         """
         return self._elect(np.zeros(self.spec.num_voxels, self.free.dtype))
 
-    def _elect(self, counts: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    def _elect(self, counts: AnyArray) -> tuple[AnyArray, AnyArray]:
         """Return the (V,) classes with most votes, ties to the lowest id, and the (V,) sums of
         votes. `counts` has the votes of class 0.
         """
@@ -394,12 +402,12 @@ class Votes:
         kernel.elect(self.occupied, labels, counts)
         return labels, counts
 
-    def occupied_counts(self) -> NDArray[np.int64]:
+    def occupied_counts(self) -> IntArray:
         """Return (X, Y, Z) int64: votes for all classes except free space."""
         counts = np.bincount(self.occupied["voxel"], self.occupied["votes"], self.spec.num_voxels)
         return counts.astype(np.int64).reshape(self.spec.size)
 
-    def to_sparse(self) -> NDArray[Any]:
+    def to_sparse(self) -> AnyArray:
         """Return the votes as the layout stores them: non-zero ones only, sorted by voxel, then by
         label; free space is label 0.
 

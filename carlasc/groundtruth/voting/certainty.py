@@ -23,11 +23,24 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import (
+    AnyArray,
+    AnyFloatArray,
+    AnyIntArray,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    Int32Array,
+    IntArray,
+    LabelArray,
+    Uint8Array,
+    Uint16Array,
+)
 from carlasc.core.classes import ClassTable
 from carlasc.core.compiling import cached, jit
 from carlasc.core.grids import GridSpec
@@ -73,9 +86,7 @@ UNKNOWN = 0.5
 _BLOCK = 1 << 14  # voxels whose arrays fit into the L2 cache
 
 
-def matter_of(
-    labels: NDArray[np.integer], in_body: NDArray[np.bool_], classes: ClassTable
-) -> NDArray[np.int8]:
+def matter_of(labels: AnyIntArray, in_body: BoolArray, classes: ClassTable) -> NDArray[np.int8]:
     """Return the kind of matter in each voxel.
 
     Args:
@@ -92,9 +103,7 @@ def matter_of(
     return matter
 
 
-def is_occupied(
-    hits: NDArray[np.integer], free_m: NDArray[np.floating], matter: NDArray[np.int8]
-) -> NDArray[np.bool_]:
+def is_occupied(hits: AnyIntArray, free_m: AnyFloatArray, matter: NDArray[np.int8]) -> BoolArray:
     """Return (V,) bool: which voxels have more hits per metre of free path than the threshold of
     their matter.
 
@@ -107,13 +116,13 @@ def is_occupied(
 
 
 def probability(
-    hits: NDArray[np.integer],
-    free_m: NDArray[np.floating],
+    hits: AnyIntArray,
+    free_m: AnyFloatArray,
     matter: NDArray[np.int8],
-    in_body: NDArray[np.bool_],
+    in_body: BoolArray,
     spec: GridSpec,
     step_m: float,
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """Return (V,) the calibrated probability that each voxel is occupied; `UNKNOWN` without hits
     and free path.
 
@@ -135,13 +144,13 @@ def probability(
 
 
 def _probability(
-    hits: NDArray[np.integer],
-    free_m: NDArray[np.floating],
+    hits: AnyIntArray,
+    free_m: AnyFloatArray,
     matter: NDArray[np.int8],
-    in_body: NDArray[np.bool_],
+    in_body: BoolArray,
     spec: GridSpec,
     step_m: float,
-) -> NDArray[np.floating]:
+) -> AnyFloatArray:
     # 0 for voxels of 0.4 m, 1 for voxels of 0.2 m: the two sizes of the calibration.
     finer = math.log2(0.4 / min(max(float(np.cbrt(_volume(spec))), _SMALLEST_M), _LARGEST_M))
     samples = np.log(np.maximum(free_m / step_m, 1.0))
@@ -183,10 +192,10 @@ class VoxelCertainty:
         FormatError: the arrays differ in shape.
     """
 
-    occupied: NDArray[np.floating]
-    classes: NDArray[Any]
-    flags: NDArray[np.uint8]
-    views: NDArray[np.uint16]
+    occupied: AnyFloatArray
+    classes: AnyArray
+    flags: Uint8Array
+    views: Uint16Array
 
     def __post_init__(self) -> None:
         for name, array in (("flags", self.flags), ("views", self.views)):
@@ -198,7 +207,7 @@ class VoxelCertainty:
                 )
 
 
-def class_shares(votes: NDArray[Any], classes: ClassTable) -> NDArray[Any]:
+def class_shares(votes: AnyArray, classes: ClassTable) -> AnyArray:
     """Return the probability of each class of the voxels with votes, if they are occupied: its
     share of the votes.
 
@@ -254,12 +263,12 @@ class _Cast(NamedTuple):
         size: (3,) int64 of the grid.
     """
 
-    voxels: NDArray[np.int32]
-    begins: NDArray[np.int64]
-    own: NDArray[np.int64]
-    weight: NDArray[np.float64]
-    rows: NDArray[np.int32]
-    size: NDArray[np.int64]
+    voxels: Int32Array
+    begins: IntArray
+    own: IntArray
+    weight: FloatArray
+    rows: Int32Array
+    size: IntArray
 
 
 @dataclass(frozen=True)
@@ -274,12 +283,12 @@ class ClassConsensus:
         wrong: estimated share of wrong votes.
     """
 
-    labels: NDArray[np.unsignedinteger]
-    shares: NDArray[Any]
+    labels: LabelArray
+    shares: AnyArray
     wrong: float
 
 
-def agree(votes: NDArray[Any], spec: GridSpec, classes: ClassTable) -> ClassConsensus:
+def agree(votes: AnyArray, spec: GridSpec, classes: ClassTable) -> ClassConsensus:
     """Return the class of each voxel from the votes of all scans.
 
     Args:
@@ -342,7 +351,7 @@ def agree(votes: NDArray[Any], spec: GridSpec, classes: ClassTable) -> ClassCons
     return ClassConsensus(labels, table[np.argsort(table["voxel"], kind="stable")], wrong)
 
 
-def _needed(confusion: NDArray[np.float64], frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+def _needed(confusion: FloatArray, frequency: FloatArray) -> FloatArray:
     """Return (K,) the number of votes for one class alone with which neighbours are not needed."""
     gain = np.log(np.diag(confusion)) - np.log(confusion)  # (other class, voted class)
     odds = np.log(_SURE / (1 - _SURE)) + np.log(
@@ -371,7 +380,7 @@ def _neighbour(cast: _Cast, i: int, x: int, y: int, z: int) -> int:
 
 
 @cached
-def _compare(cast: _Cast, confusion: NDArray[np.float64], frequency: NDArray[np.float64]) -> None:
+def _compare(cast: _Cast, confusion: FloatArray, frequency: FloatArray) -> None:
     """Count votes in voxels among neighbours of their class: `confusion[a, b]`: votes for b in
     voxels of a. `frequency` counts all voxels.
     """
@@ -403,10 +412,10 @@ def _compare(cast: _Cast, confusion: NDArray[np.float64], frequency: NDArray[np.
 @cached
 def _find_shares(
     cast: _Cast,
-    confusion: NDArray[np.float64],
-    frequency: NDArray[np.float64],
-    place: NDArray[np.int64],
-    shares: NDArray[np.float32],
+    confusion: FloatArray,
+    frequency: FloatArray,
+    place: IntArray,
+    shares: Float32Array,
 ) -> None:
     """Find the shares of classes: the probabilities from the votes, and from neighbours if these
     are uncertain, then the mixture.
@@ -448,10 +457,10 @@ def _find_shares(
 def _posterior(
     cast: _Cast,
     i: int,
-    few: NDArray[np.float64],
-    many: NDArray[np.float64],
-    prior: NDArray[np.float64],
-    out: NDArray[np.float32],
+    few: FloatArray,
+    many: FloatArray,
+    prior: FloatArray,
+    out: Float32Array,
 ) -> None:
     """Write the probability of each class of a voxel from its votes and a prior."""
     begins, own, weight = cast.begins, cast.own, cast.weight
@@ -474,10 +483,10 @@ def _posterior(
 def _neighbour_prior(
     cast: _Cast,
     i: int,
-    frequency: NDArray[np.float64],
-    place: NDArray[np.int64],
-    shares: NDArray[np.float32],
-    prior: NDArray[np.float64],
+    frequency: FloatArray,
+    place: IntArray,
+    shares: Float32Array,
+    prior: FloatArray,
 ) -> None:
     """Write the prior of each class from the neighbours of a voxel.
 
@@ -506,10 +515,10 @@ def _neighbour_prior(
 def _mix_shares(
     cast: _Cast,
     i: int,
-    confusion: NDArray[np.float64],
-    shares: NDArray[np.float32],
-    likeliest: NDArray[np.float64],
-    left: NDArray[np.float64],
+    confusion: FloatArray,
+    shares: Float32Array,
+    likeliest: FloatArray,
+    left: FloatArray,
 ) -> None:
     """Replace the class probabilities of a voxel by the shares of classes that fit its votes: a
     voxel may hold two objects.

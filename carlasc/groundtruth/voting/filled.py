@@ -6,8 +6,8 @@ A pole, a roof or a kerb hides the space behind this box, not behind its whole v
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import Uint8Array, Uint16Array
 from carlasc.core.cells import Cells, transform
 from carlasc.core.compiling import cached
 from carlasc.groundtruth.voting.kernel import ANYWHERE, Voters
@@ -15,7 +15,7 @@ from carlasc.groundtruth.voting.kernel import ANYWHERE, Voters
 STEPS = 256  # number of steps of a box along an edge of a voxel
 
 
-def no_boxes(num_voxels: int) -> NDArray[np.uint8]:
+def no_boxes(num_voxels: int) -> Uint8Array:
     """Return (V, 6) uint8: the boxes of voxels without points, in which first x, y, z are greater
     than last x, y, z.
     """
@@ -24,7 +24,7 @@ def no_boxes(num_voxels: int) -> NDArray[np.uint8]:
 
 @cached
 def widen_boxes(
-    cast: Voters, cells: Cells, region: int, regions: NDArray[np.uint16], boxes: NDArray[np.uint8]
+    cast: Voters, cells: Cells, region: int, regions: Uint16Array, boxes: Uint8Array
 ) -> None:
     """Widen the boxes of Cartesian voxels by the points of an observation that vote for their
     classes.

@@ -9,11 +9,20 @@ free space are stored densely, votes for other classes as a linked list of candi
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import (
+    AnyArray,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    Int32Array,
+    IntArray,
+    Uint8Array,
+    Uint16Array,
+)
 from carlasc.core.cells import Cells, Pose, transform
 from carlasc.core.compiling import cached, inlined, jit
 from carlasc.groundtruth.voting.rays import (
@@ -79,14 +88,14 @@ class Tally(NamedTuple):
     """
 
     once: bool
-    free: NDArray[Any]
-    passed: NDArray[np.uint8]
-    heads: NDArray[np.int32]
-    candidates: NDArray[Any]
-    used: NDArray[np.int64]
-    regions: NDArray[np.uint16]
-    views: NDArray[np.uint16]
-    viewers: NDArray[np.int32]
+    free: AnyArray
+    passed: Uint8Array
+    heads: Int32Array
+    candidates: AnyArray
+    used: IntArray
+    regions: Uint16Array
+    views: Uint16Array
+    viewers: Int32Array
 
 
 class Voters(NamedTuple):
@@ -104,13 +113,13 @@ class Voters(NamedTuple):
         ends: (K,) index after the last point of each origin.
     """
 
-    points: NDArray[np.float32]
-    labels: NDArray[np.uint16]
-    hits: NDArray[np.bool_]
-    sure: NDArray[np.float32]
-    weights: NDArray[np.uint8]
-    poses: NDArray[np.float64]
-    ends: NDArray[np.int64]
+    points: Float32Array
+    labels: Uint16Array
+    hits: BoolArray
+    sure: Float32Array
+    weights: Uint8Array
+    poses: FloatArray
+    ends: IntArray
 
 
 @inlined
@@ -123,13 +132,13 @@ def count_view(voxel: int, voter: int, tally: Tally) -> None:
 
 @jit
 def vote_occupied(
-    points: NDArray[np.float32],
-    labels: NDArray[np.uint16],
-    hits: NDArray[np.bool_],
-    sure: NDArray[np.float32],
-    weights: NDArray[np.uint8],
+    points: Float32Array,
+    labels: Uint16Array,
+    hits: BoolArray,
+    sure: Float32Array,
+    weights: Uint8Array,
     rays: RayBlock,
-    voxels: NDArray[np.int32],
+    voxels: Int32Array,
     pose: Pose,
     cells: Cells,
     voter: int,
@@ -191,9 +200,9 @@ def vote_for(voxel: int, label: int, weight: int, voter: int, tally: Tally) -> i
 
 @jit
 def vote_free(
-    points: NDArray[np.float32],
-    labels: NDArray[np.uint16],
-    weights: NDArray[np.uint8],
+    points: Float32Array,
+    labels: Uint16Array,
+    weights: Uint8Array,
     rays: RayBlock,
     pose: Pose,
     view: GridView,
@@ -308,7 +317,7 @@ def vote(
     voter: int,
     hit_region: int,
     free_region: int,
-    apart: NDArray[np.int64],
+    apart: IntArray,
     tally: Tally,
 ) -> None:
     """Add the votes of one observation.
@@ -378,7 +387,7 @@ def count_passed(region: int, tally: Tally) -> None:
 
 
 @cached
-def collect(heads: NDArray[np.int32], candidates: NDArray[Any], rows: NDArray[Any]) -> None:
+def collect(heads: Int32Array, candidates: AnyArray, rows: AnyArray) -> None:
     """Write the candidates of all voxels into a table, sorted by voxel, then by label.
 
     Args:
@@ -405,7 +414,7 @@ def collect(heads: NDArray[np.int32], candidates: NDArray[Any], rows: NDArray[An
 
 
 @cached
-def elect(rows: NDArray[Any], labels: NDArray[Any], counts: NDArray[Any]) -> None:
+def elect(rows: AnyArray, labels: AnyArray, counts: AnyArray) -> None:
     """Find the class with most votes in each voxel, where ties go to the lowest id, and the sum of
     its votes.
 
@@ -430,7 +439,7 @@ def elect(rows: NDArray[Any], labels: NDArray[Any], counts: NDArray[Any]) -> Non
 
 
 @cached
-def interleave(free: NDArray[Any], rows: NDArray[Any], votes: NDArray[Any], most: int) -> None:
+def interleave(free: AnyArray, rows: AnyArray, votes: AnyArray, most: int) -> None:
     """Write the votes of all classes into one table, sorted by voxel, then by label.
 
     Args:

@@ -19,8 +19,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import Float32Array, FloatArray, Int32Array, Uint16Array
 from carlasc.core.cells import (
     AZIMUTH_ERROR,
     Cells,
@@ -173,15 +173,15 @@ class RayBlock(NamedTuple):
         state: SURE, DROPPED or UNSURE.
     """
 
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    z: NDArray[np.float64]
-    dx: NDArray[np.float64]
-    dy: NDArray[np.float64]
-    dz: NDArray[np.float64]
-    first: NDArray[np.float64]
-    last: NDArray[np.float64]
-    state: NDArray[np.float64]
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+    dx: FloatArray
+    dy: FloatArray
+    dz: FloatArray
+    first: FloatArray
+    last: FloatArray
+    state: FloatArray
 
 
 @jit
@@ -218,8 +218,8 @@ def narrow(
 
 @jit
 def clip(
-    points: NDArray[np.float32],
-    labels: NDArray[np.uint16],
+    points: Float32Array,
+    labels: Uint16Array,
     free_step_m: float,
     view: GridView,
     rays: RayBlock,
@@ -257,7 +257,7 @@ def clip(
 
 
 @jit
-def place_points(rays: RayBlock, view: GridView, voxels: NDArray[np.int32]) -> None:
+def place_points(rays: RayBlock, view: GridView, voxels: Int32Array) -> None:
     """Find the voxels of the points of a block: their index, the number of voxels for points
     outside the grid, or DOUBTFUL.
     """

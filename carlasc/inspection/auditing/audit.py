@@ -16,8 +16,8 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import Uint8Array
 from carlasc.core.frames import Frames
 from carlasc.errors import ArgumentError, CarlascError, reading
 from carlasc.groundtruth import FromScans
@@ -204,7 +204,7 @@ def audit(
 
 def voxels_of(
     result: AuditResult, path: str, number: int, frame: int
-) -> tuple[MatchedGrids, NDArray[np.uint8]]:
+) -> tuple[MatchedGrids, Uint8Array]:
     """Count a frame of an audit again: return its grids, and the states of its voxels (see
     `FrameCounter.add_frame`).
     """

@@ -9,8 +9,17 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import (
+    AnyFloatArray,
+    AnyIntArray,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    LabelArray,
+    Uint8Array,
+)
 from carlasc.core.cells import first_of_cells
 from carlasc.core.geometry import invert, thin, transform_points
 from carlasc.core.scans import Scan
@@ -51,23 +60,23 @@ class _Frame:
 
     number: int
     scan: Scan
-    points: NDArray[np.float64]  # (N, 3) in the frame of the grid
-    voxels: NDArray[np.int64]
-    labels: NDArray[np.unsignedinteger]  # (X, Y, Z)
-    occupied: NDArray[np.bool_]
-    known: NDArray[np.bool_] | None
-    crossed: NDArray[np.int64]
+    points: FloatArray  # (N, 3) in the frame of the grid
+    voxels: IntArray
+    labels: LabelArray  # (X, Y, Z)
+    occupied: BoolArray
+    known: BoolArray | None
+    crossed: IntArray
     turns: bool  # whether the grid is cylindrical
 
     @cached_property
-    def hit(self) -> NDArray[np.bool_]:
+    def hit(self) -> BoolArray:
         """(X, Y, Z) which voxels hold a return."""
         hit = np.zeros(self.occupied.size, np.bool_)
         hit[self.voxels[self.voxels >= 0]] = True
         return hit.reshape(self.occupied.shape)
 
     @cached_property
-    def around(self) -> NDArray[np.bool_]:
+    def around(self) -> BoolArray:
         """(X, Y, Z) these voxels and their neighbours."""
         return grown(self.hit, self.turns)
 
@@ -87,9 +96,9 @@ class FrameCounter:
     actors: MovingActors
     window: tuple[int, int] | None = None
     _scans: dict[int, Scan] = field(default_factory=dict, init=False, repr=False)
-    _spread: dict[int, NDArray[np.float64]] = field(default_factory=dict, init=False, repr=False)
+    _spread: dict[int, FloatArray] = field(default_factory=dict, init=False, repr=False)
 
-    def add_frame(self, sums: Sums, number: int, frame: int) -> NDArray[np.uint8]:
+    def add_frame(self, sums: Sums, number: int, frame: int) -> Uint8Array:
         """Add a frame to sums, and return the states of its voxels.
 
         Args:
@@ -139,7 +148,7 @@ class FrameCounter:
     def _families(self) -> list[Family]:
         return families(self.matched.spec)
 
-    def _fits(self, seen: _Frame) -> NDArray[np.int64]:
+    def _fits(self, seen: _Frame) -> IntArray:
         """Return (H, 2) points, and those in occupied voxels, under all corrections of all
         families.
         """
@@ -160,10 +169,10 @@ class FrameCounter:
     def _fit(
         self,
         seen: _Frame,
-        warps: NDArray[np.float64],
-        points: NDArray[np.float64],
+        warps: FloatArray,
+        points: FloatArray,
         later_s: float = 0.0,
-    ) -> NDArray[np.int64]:
+    ) -> IntArray:
         at_points = labels_at(
             points, self.matched.spec, seen.occupied, warps=warps, later_s=later_s
         )
@@ -174,7 +183,7 @@ class FrameCounter:
     def _most(self) -> int:
         return int(np.clip(_IN_ALL // len(self.matched.frames), _LEAST, _MOST))
 
-    def _fit_points(self, frame: int) -> NDArray[np.float64]:
+    def _fit_points(self, frame: int) -> FloatArray:
         """Return (N, 3) points of a scan inside the grid, thinned evenly in space; none if it
         cannot be read.
         """
@@ -213,11 +222,11 @@ class FrameCounter:
     def _second(self, frame: int) -> float:
         return float(self.matched.trajectory[1][self._row(frame)])
 
-    def _grid_T_world(self, frame: int) -> NDArray[np.float64] | None:
+    def _grid_T_world(self, frame: int) -> FloatArray | None:
         poses = self.matched.trajectory[2]
         return None if poses is None else self.matched.grid_T_scan @ invert(poses[self._row(frame)])
 
-    def _standing(self, frame: int, other: int) -> NDArray[np.float64] | None:
+    def _standing(self, frame: int, other: int) -> FloatArray | None:
         """Return (N, 3) returns of another scan inside the grid of a frame, without classes that
         can move; None without the scan.
         """
@@ -267,7 +276,7 @@ class FrameCounter:
             confusion = np.bincount(own[both] * (size + 1) + met, minlength=(size + 1) ** 2)
             add(sums, "confusion", confusion.reshape(size + 1, size + 1))
 
-    def _add_false_free(self, sums: Sums, seen: _Frame) -> NDArray[np.bool_]:
+    def _add_false_free(self, sums: Sums, seen: _Frame) -> BoolArray:
         """Count returns in free voxels by class, distance and height, and return these voxels."""
         wrong = np.zeros(seen.occupied.shape, np.bool_)
         if seen.known is not None:
@@ -281,7 +290,7 @@ class FrameCounter:
             self._add_by(sums, "returns", kinds, seen.points[own], free)
         return wrong
 
-    def _add_phantoms(self, sums: Sums, seen: _Frame) -> NDArray[np.bool_]:
+    def _add_phantoms(self, sums: Sums, seen: _Frame) -> BoolArray:
         """Count occupied voxels that rays see, and those that rays cross, by class, distance and
         height; return the crossed ones.
         """
@@ -304,9 +313,9 @@ class FrameCounter:
         self,
         sums: Sums,
         name: str,
-        kinds: NDArray[np.integer],
-        points: NDArray[np.floating],
-        wrong: NDArray[np.bool_],
+        kinds: AnyIntArray,
+        points: AnyFloatArray,
+        wrong: BoolArray,
     ) -> None:
         """Add (K, B, H, 2) counts by class, distance and height: all, and the wrong ones."""
         low, high = self.matched.spec.lower[2], self.matched.spec.upper[2]
@@ -339,7 +348,7 @@ class FrameCounter:
         add(sums, "unknown", [seen.known.size, *(cause.sum() for cause in causes)])
 
     @cached_property
-    def _elevations(self) -> NDArray[np.float32]:
+    def _elevations(self) -> Float32Array:
         x, y, z = np.moveaxis(
             self.matched.spec.from_axes(self.matched.spec.centers().reshape(-1, 3)), -1, 0
         )
@@ -349,7 +358,7 @@ class FrameCounter:
 
     # Actors
 
-    def _add_actors(self, sums: Sums, seen: _Frame) -> NDArray[np.bool_]:
+    def _add_actors(self, sums: Sums, seen: _Frame) -> BoolArray:
         """Count voxels, and occupied voxels, on the path and on the body of each actor; return the
         occupied voxels of paths.
         """
@@ -377,7 +386,7 @@ class FrameCounter:
                     )
         return trails.reshape(seen.occupied.shape)
 
-    def _members(self, seen: _Frame) -> list[tuple[str, NDArray[np.integer]]]:
+    def _members(self, seen: _Frame) -> list[tuple[str, AnyIntArray]]:
         """Return the points of each actor in a scan, by instances or by tracks."""
         ids, labels = seen.scan.instances, seen.scan.labels
         if ids is None or not ids.any():
@@ -399,9 +408,9 @@ class FrameCounter:
         self,
         track: Track,
         frames: Sequence[int],
-        grid_T_world: NDArray[np.float64],
+        grid_T_world: FloatArray,
         margin_m: float,
-    ) -> NDArray[np.int64]:
+    ) -> IntArray:
         """Return the voxels in the body of an actor at some frames, wider by a margin.
 
         A negative margin also leaves out the lowest voxel.
@@ -422,7 +431,7 @@ class FrameCounter:
         return voxels_at(lattice, grid_T_world @ np.stack(poses), spec)
 
 
-def _are_returns(scan: Scan) -> NDArray[np.bool_]:
+def _are_returns(scan: Scan) -> BoolArray:
     """Return (N,) which points are returns: some sensors write (0, 0, 0) where there is none."""
     x, y, z = scan.points.T
     return np.asarray((x != 0) | (y != 0) | (z != 0))

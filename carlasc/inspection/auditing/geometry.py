@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray
 from carlasc.core.axes import choices_of_axes
 from carlasc.core.geometry import rotation_z
 from carlasc.core.grids import GridSpec
@@ -37,7 +37,7 @@ class _Fit:
     """How well the corrections of a family fit."""
 
     family: Family
-    shares: NDArray[np.float64]  # (1 + DRAWS, V), -1 where no point was tried
+    shares: FloatArray  # (1 + DRAWS, V), -1 where no point was tried
 
     @cached_property
     def best(self) -> int:
@@ -236,8 +236,8 @@ class Family:
 
     name: str
     kind: str
-    values: NDArray[np.float64]
-    warps: NDArray[np.float64]
+    values: FloatArray
+    warps: FloatArray
     neutral: int
     unit: str
     least: float
@@ -293,8 +293,8 @@ def shift_step(spec: GridSpec, axis: str) -> float:
 def _family(
     name: str,
     kind: str,
-    values: Sequence[float] | NDArray[np.float64] | range,
-    matrices: Sequence[NDArray[np.float64]],
+    values: Sequence[float] | FloatArray | range,
+    matrices: Sequence[FloatArray],
     advice: str,
     unit: str = "",
     least: float = 0.0,

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.classes import ClassTable
 from carlasc.errors import count, first_names
 from carlasc.inspection.auditing.counting import HEIGHTS
@@ -213,7 +213,7 @@ class _Judge:
         return made, without
 
     @cached_property
-    def _confusion(self) -> NDArray[np.int64] | None:
+    def _confusion(self) -> IntArray | None:
         """(S, K, K) points by their class and that of their voxel, of the classes of the grids;
         None without any.
         """
@@ -298,9 +298,9 @@ def _is_above(share: Share | None, limit: float) -> State | bool:
 
 
 def _explains(
-    drawn: NDArray[np.float64],
-    rows: NDArray[np.float64],
-    right: NDArray[np.float64],
+    drawn: FloatArray,
+    rows: FloatArray,
+    right: FloatArray,
     i: int,
     thin: bool,
 ) -> int | None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import BoolArray, FloatArray, IntArray
 from carlasc.core.cells import Cells, find_voxel
 from carlasc.core.compiling import cached
 from carlasc.core.grids import GridSpec
@@ -14,9 +14,7 @@ _SAMPLES = 4  # samples on a ray per edge of the smallest voxel
 _INSIDE = 3
 
 
-def crossings(
-    origins: NDArray[np.float64], points: NDArray[np.float64], spec: GridSpec, margin_m: float
-) -> NDArray[np.int64]:
+def crossings(origins: FloatArray, points: FloatArray, spec: GridSpec, margin_m: float) -> IntArray:
     """Return (X, Y, Z) how many rays cross each voxel, not only a corner of it, before they come
     near their return.
 
@@ -52,9 +50,7 @@ def _cross(origins, points, cells, step_m, margin_m, crossed):  # type: ignore[n
                 crossed[voxel] += 1
 
 
-def voxels_at(
-    points: NDArray[np.float64], poses: NDArray[np.float64], spec: GridSpec
-) -> NDArray[np.int64]:
+def voxels_at(points: FloatArray, poses: FloatArray, spec: GridSpec) -> IntArray:
     """Return the voxels that hold any of (N, 3) points at any of (P, 4, 4) poses in the frame of
     the grid, rising.
     """
@@ -78,7 +74,7 @@ def _mark(points, poses, cells, inside):  # type: ignore[no-untyped-def]
             inside[voxel] = True
 
 
-def grown(mask: NDArray[np.bool_], turns: bool) -> NDArray[np.bool_]:
+def grown(mask: BoolArray, turns: bool) -> BoolArray:
     """Return a mask grown by one voxel in each direction; if `turns`, the azimuth of a cylindrical
     grid is periodic.
     """

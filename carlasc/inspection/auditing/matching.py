@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray, IntArray, LabelArray
 from carlasc.core.benchmarks import (
     CARLAOCC,
     CARLAOCC_TO_CARLA,
@@ -130,7 +130,7 @@ class MatchedGrids:
         return self.grids.classes or (None if self.grids.benchmark else self.scans.metadata.classes)
 
     @cached_property
-    def lookup(self) -> NDArray[np.int64] | None:
+    def lookup(self) -> IntArray | None:
         """(K,) class of the grids for each class of the scans, -1 for none; None if no map is
         known.
         """
@@ -152,9 +152,7 @@ class MatchedGrids:
             return []
         return sorted({int(self.lookup[i]) for i in self.scans.metadata.classes.ground} - {-1, 0})
 
-    def read(
-        self, frame: int
-    ) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_], NDArray[np.bool_] | None]:
+    def read(self, frame: int) -> tuple[LabelArray, BoolArray, BoolArray | None]:
         """Return (X, Y, Z) labels of a grid, occupied voxels, and known voxels; None for these if
         the files do not contain them.
 
@@ -177,14 +175,14 @@ class MatchedGrids:
             occupied &= known
         return labels, occupied, known
 
-    def place(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
+    def place(self, points: AnyFloatArray) -> FloatArray:
         """Return (N, 3) points of the sensor's frame in the frame of the grids."""
         return transform_points(self.grid_T_scan, points)
 
     @cached_property
     def trajectory(
         self,
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64] | None]:
+    ) -> tuple[IntArray, FloatArray, FloatArray | None]:
         """(F,) frames with scans, their seconds, and (F, 4, 4) poses; None without poses.txt."""
         frames, documents = self.scans.frames("points"), self.scans.documents()
         poses = (

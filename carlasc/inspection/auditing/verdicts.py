@@ -12,7 +12,8 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+
+from carlasc.core.arrays import FloatArray, IntArray
 
 State = Literal["fault", "undetermined", "sound"]
 STATES: tuple[State, ...] = ("fault", "undetermined", "sound")  # worst first
@@ -119,7 +120,7 @@ class AuditResult:
 
 DRAWS = 300
 
-Sums = dict[str, NDArray[np.int64]]
+Sums = dict[str, IntArray]
 """Counts by name, each an array of its own shape; missing ones are 0."""
 
 Share = tuple[float, float, float]
@@ -141,24 +142,24 @@ class Stretches:
 
     parts: Sequence[Sums]
 
-    def stacked(self, name: str) -> NDArray[np.int64] | None:
+    def stacked(self, name: str) -> IntArray | None:
         """Return (S, ...) the counts of each stretch; None if no stretch has any."""
         empty = next((np.zeros_like(part[name]) for part in self.parts if name in part), None)
         return None if empty is None else np.stack([part.get(name, empty) for part in self.parts])
 
     @cached_property
-    def _weights(self) -> NDArray[np.float64]:
+    def _weights(self) -> FloatArray:
         count = len(self.parts)
         drawn = np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), DRAWS)
         return np.concatenate([np.ones((1, count)), drawn])
 
-    def draw(self, counts: NDArray[np.int64]) -> NDArray[np.float64]:
+    def draw(self, counts: IntArray) -> FloatArray:
         """Return (1 + DRAWS, ...) sums of (S, ...) counts: of all stretches, then of stretches that
         are drawn with replacement.
         """
         return np.tensordot(self._weights, counts.astype(np.float64), axes=1)
 
-    def drawn(self, name: str) -> NDArray[np.float64] | None:
+    def drawn(self, name: str) -> FloatArray | None:
         """Return (1 + DRAWS, ...) sums; None if no stretch has any."""
         counts = self.stacked(name)
         return None if counts is None else self.draw(counts)
@@ -171,7 +172,7 @@ class Stretches:
         return None if drawn is None else share_of(drawn[:, 1], drawn[:, 0])
 
 
-def share_of(part: NDArray[np.float64], whole: NDArray[np.float64]) -> Share | None:
+def share_of(part: FloatArray, whole: FloatArray) -> Share | None:
     """Return a share and its interval from (1 + DRAWS,) sums; None if the whole is 0."""
     if not whole[0] > 0:
         return None

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray
 from carlasc.errors import ArgumentError, import_extra
 from carlasc.storage import layout
 from carlasc.storage.files import sync_tree, unfinished
@@ -122,7 +122,7 @@ class HDF5Writer(PackedWriter):
     def _start_field(self, field: str) -> FieldWriter:
         entry = layout.field_named(field)
 
-        def plan(arrays: list[NDArray[Any]]) -> FieldLayout:
+        def plan(arrays: list[AnyArray]) -> FieldLayout:
             return FieldLayout.plan(
                 field, self._options, typical_size(entry, arrays, self._rows, self.read_document)
             )
@@ -180,7 +180,7 @@ class HDF5FieldWriter(FieldWriter):
         output: HDF5Output,
         node: str,
         field: str,
-        plan: Callable[[list[NDArray[Any]]], FieldLayout],
+        plan: Callable[[list[AnyArray]], FieldLayout],
     ) -> None:
         super().__init__(field)
         self.table: FrameTable = {}
@@ -190,7 +190,7 @@ class HDF5FieldWriter(FieldWriter):
         self._planned = False
         self._columns: dict[str, HDF5ColumnWriter] = {}
 
-    def write(self, frame: int, array: NDArray[Any]) -> None:
+    def write(self, frame: int, array: AnyArray) -> None:
         """Divide one frame into chunks. Chunks of several frames are written together."""
         if not self._planned and array.size:
             self.layout, self._planned = self._plan([array]), True
@@ -220,11 +220,11 @@ class HDF5ColumnWriter:
         self._output = output
         self._node = node
         self._encoding = column.encoding
-        self._held: list[tuple[int, int, NDArray[Any]]] = []  # frame, number in the frame, chunk
+        self._held: list[tuple[int, int, AnyArray]] = []  # frame, number in the frame, chunk
         self._checksums: list[int] = []
         self._dataset = output.create(node, field_layout, column)
 
-    def append(self, frame: int, chunks: list[NDArray[Any]]) -> None:
+    def append(self, frame: int, chunks: list[AnyArray]) -> None:
         """Add a frame's chunks."""
         self._held += [(frame, number, chunk) for number, chunk in enumerate(chunks)]
         if len(self._held) >= _AHEAD:
@@ -281,7 +281,7 @@ class HDF5Output:
         _write_attributes(self._file.require_group(node), attributes)
         self.check()
 
-    def write_small(self, node: str, array: NDArray[Any], attributes: dict[str, Any]) -> None:
+    def write_small(self, node: str, array: AnyArray, attributes: dict[str, Any]) -> None:
         """Write a data set of one chunk."""
         self.remove(node)
         compact = (
@@ -344,6 +344,6 @@ def _write_attributes(node: Any, attributes: dict[str, Any]) -> None:
             node.attrs.create(f"{name}:json", _fixed_text(json.dumps(value)))
 
 
-def _fixed_text(text: str) -> NDArray[Any]:
+def _fixed_text(text: str) -> AnyArray:
     h5py, data = import_extra("h5py", "hdf5"), text.encode()
     return np.array(data, h5py.string_dtype("utf-8", max(1, len(data))))

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, Uint32Array
 from carlasc.errors import FormatError, import_extra, reading
 from carlasc.storage.arrays import check_ratio
 from carlasc.storage.files import damaged, parse_json_value
@@ -61,12 +61,12 @@ class HDF5Store(ArrayStore):
             group = find_node(file, node, self.location)
             return None if group is None else _read_attributes(group, f"{self.location}/{node}")
 
-    def read_small(self, node: str) -> NDArray[Any]:
+    def read_small(self, node: str) -> AnyArray:
         """Return a whole data set."""
         with self._open() as file:
             return self._read_small(file, node)
 
-    def _read_small(self, file: Any, node: str) -> NDArray[Any]:
+    def _read_small(self, file: Any, node: str) -> AnyArray:
         dataset = self._dataset(file, node)
         check_small(dataset, f"{self.location}: {dataset.name}")
         return np.asarray(dataset[...])
@@ -133,9 +133,7 @@ class HDF5Array(StoredArray):
     _checksums: dict[int, int]
 
     @classmethod
-    def from_dataset(
-        cls, tree: Tree, path: str, dataset: Any, checksums: NDArray[np.uint32]
-    ) -> HDF5Array:
+    def from_dataset(cls, tree: Tree, path: str, dataset: Any, checksums: Uint32Array) -> HDF5Array:
         """Look up the offsets of the chunks of a data set.
 
         Args:

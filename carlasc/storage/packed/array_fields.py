@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, Float32Array, IntArray
 from carlasc.errors import FormatError, MissingDataError, reading
 from carlasc.storage.arrays import check_size
 from carlasc.storage.packed.array_layout import FieldLayout
@@ -27,8 +27,8 @@ class ArrayField:
         self,
         where: str,
         field_layout: FieldLayout,
-        frames: NDArray[np.int64],
-        counts: Mapping[str, NDArray[np.int64]],
+        frames: IntArray,
+        counts: Mapping[str, IntArray],
         array_of: Callable[[str], StoredArray],
         *,
         local: bool,
@@ -74,7 +74,7 @@ class ArrayField:
             )
         return columns
 
-    def read(self, frames: list[int]) -> list[NDArray[Any]]:
+    def read(self, frames: list[int]) -> list[AnyArray]:
         """Read frames.
 
         All their chunks are fetched at once from a remote store, and frames are decoded in
@@ -87,7 +87,7 @@ class ArrayField:
             [main.counts[position] if main else 0 for position in positions]
         )
 
-        def assemble(k: int) -> NDArray[Any]:
+        def assemble(k: int) -> AnyArray:
             with self._naming([frames[k]]):
                 parts = {}
                 for column in self.packing.columns:
@@ -101,9 +101,7 @@ class ArrayField:
 
         return parallel(assemble, range(len(frames)))
 
-    def read_planes(
-        self, frames: list[int], spare: list[NDArray[np.float32]]
-    ) -> list[NDArray[np.float32]]:
+    def read_planes(self, frames: list[int], spare: list[Float32Array]) -> list[Float32Array]:
         """Read the points of frames as (N, 3), each coordinate contiguous, into the memory of
         `spare` where it fits.
         """
@@ -113,7 +111,7 @@ class ArrayField:
         tasks = self._parts(column, frames)
         outputs = [column.memory_for(task, spare) for task in tasks]
 
-        def decode(k: int) -> NDArray[np.float32]:
+        def decode(k: int) -> Float32Array:
             with self._naming([frames[k]]):
                 return packing.to_metres(column.decode(tasks[k], outputs[k])).T
 
@@ -207,8 +205,8 @@ class StoredColumn:
         self,
         column: Column,
         array: StoredArray,
-        firsts: NDArray[np.int64],
-        counts: NDArray[np.int64],
+        firsts: IntArray,
+        counts: IntArray,
         is_grid: bool,
     ) -> None:
         self.column = column
@@ -238,7 +236,7 @@ class StoredColumn:
         for task in tasks:
             task.fetched = [next(data) for _ in task.chunks]
 
-    def memory_for(self, task: FramePart, spare: list[NDArray[Any]]) -> NDArray[Any]:
+    def memory_for(self, task: FramePart, spare: list[AnyArray]) -> AnyArray:
         """Return memory to decode a frame into: a spare array of the same shape, otherwise new
         memory, which is slower to write to.
         """
@@ -253,7 +251,7 @@ class StoredColumn:
                 return memory
         return np.empty(shape, self.array.dtype)
 
-    def decode(self, task: FramePart, out: NDArray[Any] | None = None) -> NDArray[Any]:
+    def decode(self, task: FramePart, out: AnyArray | None = None) -> AnyArray:
         """Decode a frame's chunks, into `out` if it is given."""
         parts = task.fetched if task.fetched is not None else self.array.fetch(task.chunks)
         if self.is_grid:
@@ -273,10 +271,10 @@ class StoredColumn:
         values = out[:, : task.count]
         return values if self.column.rows else values[0]
 
-    def _decode_chunk(self, part: memoryview, number: int, out: NDArray[Any]) -> NDArray[Any]:
+    def _decode_chunk(self, part: memoryview, number: int, out: AnyArray) -> AnyArray:
         self.array.decode(part, number, out)
         return out
 
 
-def _empty(column: Column) -> NDArray[Any]:
+def _empty(column: Column) -> AnyArray:
     return np.empty((column.rows, 0) if column.rows else 0, column.dtype)

@@ -14,8 +14,8 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, IntArray
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
 from carlasc.storage import field_files, layout
@@ -180,8 +180,8 @@ class FieldLayout:
             )
 
     def divide(
-        self, array: NDArray[Any], *, limited: bool = True
-    ) -> tuple[dict[str, int], dict[str, list[NDArray[Any]]]]:
+        self, array: AnyArray, *, limited: bool = True
+    ) -> tuple[dict[str, int], dict[str, list[AnyArray]]]:
         """Divide a frame into chunks.
 
         Args:
@@ -214,7 +214,7 @@ class FieldLayout:
             chunks[column.name] = list(self._chunks(column, values))
         return counts, chunks
 
-    def _column_for(self, family: Column, values: NDArray[Any], limited: bool) -> Column:
+    def _column_for(self, family: Column, values: AnyArray, limited: bool) -> Column:
         """Return the column for the values of a frame: the first whose type and size hold them."""
         *narrower, widest = family.both
         for column in (*(one for one in narrower if np.can_cast(values.dtype, one.dtype)), widest):
@@ -230,7 +230,7 @@ class FieldLayout:
             advice="leave the frame out, or pack to an .h5 store",
         )
 
-    def _chunks(self, column: Column, values: NDArray[Any]) -> Iterator[NDArray[Any]]:
+    def _chunks(self, column: Column, values: AnyArray) -> Iterator[AnyArray]:
         if self.is_grid:
             yield values[None].astype(column.dtype, copy=False)
             return
@@ -244,7 +244,7 @@ class FieldLayout:
 
 def typical_size(
     entry: field_files.Field,
-    arrays: list[NDArray[Any]],
+    arrays: list[AnyArray],
     rows: Mapping[str, int],
     read_document: Callable[[str], bytes | None],
 ) -> tuple[int, ...]:
@@ -291,7 +291,7 @@ def _cells(grid: str, read_document: Callable[[str], bytes | None]) -> int:
 
 def count_elements(
     layouts: Mapping[str, FieldLayout], tables: Mapping[str, FrameTable]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], list[str]]:
+) -> tuple[IntArray, IntArray, list[str]]:
     """Return the arrays `frames` and `counts` of a sequence, which readers use to find frames.
 
     Args:
@@ -316,7 +316,7 @@ def count_elements(
 
 def number_arrays(
     read_document: Callable[[str], bytes | None],
-) -> Iterator[tuple[str, NDArray[Any], dict[str, Any]]]:
+) -> Iterator[tuple[str, AnyArray, dict[str, Any]]]:
     """Yield poses and times as arrays, for programs that do not read the text files: name, values
     and attributes.
     """

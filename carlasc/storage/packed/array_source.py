@@ -9,8 +9,8 @@ from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, Float32Array, IntArray
 from carlasc.errors import FormatError
 from carlasc.storage.arrays import check_size
 from carlasc.storage.files import damaged
@@ -42,7 +42,7 @@ class ArrayStore(ABC):
         """Return the attributes of a group or an array; None if the node does not exist."""
 
     @abstractmethod
-    def read_small(self, node: str) -> NDArray[Any]:
+    def read_small(self, node: str) -> AnyArray:
         """Return a whole array of one chunk."""
 
     @abstractmethod
@@ -124,18 +124,18 @@ class ArraySequence(PackedSequence[ArrayField]):
         super().__init__(path, location, attributes)
         self.tree = store.tree
 
-    def read(self, field: str, frame: int) -> NDArray[Any]:
+    def read(self, field: str, frame: int) -> AnyArray:
         """Read one field of one frame."""
         return self._read_again(lambda: self._field(field).read([frame])[0])
 
-    def read_many(self, field: str, frames: Iterable[int]) -> list[NDArray[Any]]:
+    def read_many(self, field: str, frames: Iterable[int]) -> list[AnyArray]:
         """Read several frames. They are fetched together and decoded in parallel."""
         numbers = list(frames)
         return self._read_again(lambda: self._field(field).read(numbers))
 
     def read_xyz(
-        self, frames: Iterable[int], spare: list[NDArray[np.float32]] | None = None
-    ) -> list[NDArray[np.float32]]:
+        self, frames: Iterable[int], spare: list[Float32Array] | None = None
+    ) -> list[Float32Array]:
         """Read the coordinates of points as contiguous planes, as they are stored.
 
         The 4th column is not read.
@@ -172,7 +172,7 @@ class ArraySequence(PackedSequence[ArrayField]):
             return read()
 
     @cached_property
-    def _counts(self) -> tuple[NDArray[np.int64], Mapping[str, NDArray[np.int64]]]:
+    def _counts(self) -> tuple[IntArray, Mapping[str, IntArray]]:
         """The frames of the sequence, and the number of elements per frame by column; -1 if the
         field lacks the frame.
         """
@@ -183,7 +183,7 @@ class ArraySequence(PackedSequence[ArrayField]):
                 raise
             return self._read_counts()
 
-    def _read_counts(self) -> tuple[NDArray[np.int64], Mapping[str, NDArray[np.int64]]]:
+    def _read_counts(self) -> tuple[IntArray, Mapping[str, IntArray]]:
         where = f"{self.location}/counts"
         frames = self.store.read_small(f"{self.group}/frames").astype(np.int64)
         if frames.ndim != 1 or (np.diff(frames, prepend=-1) <= 0).any():

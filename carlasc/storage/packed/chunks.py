@@ -20,8 +20,8 @@ from functools import cache
 from typing import Any, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, Uint8Array
 from carlasc.errors import CarlascError, FormatError, describe, import_extra, postponed_interrupts
 from carlasc.running import count_cores
 from carlasc.storage.arrays import check_size
@@ -50,7 +50,7 @@ class Encoding:
     level: int = 5
     shuffle: int = NO_SHUFFLE
 
-    def encode(self, chunk: NDArray[Any], extra: str) -> bytes:
+    def encode(self, chunk: AnyArray, extra: str) -> bytes:
         """Return the encoded bytes of a chunk, without the checksum."""
         if self.codec == "pcodec":
             return bytes(_pcodec(self.level, extra).encode(np.ascontiguousarray(chunk).reshape(-1)))
@@ -59,7 +59,7 @@ class Encoding:
             blosc.compress(np.ascontiguousarray(chunk), b"zstd", self.level, self.shuffle, BLOCK)
         )
 
-    def decode(self, data: bytes | memoryview, out: NDArray[Any], extra: str) -> None:
+    def decode(self, data: bytes | memoryview, out: AnyArray, extra: str) -> None:
         """Decode the bytes of a chunk into `out`, a contiguous array with the shape and dtype of
         the chunk.
 
@@ -175,11 +175,11 @@ class StoredArray:
         """Read encoded chunks; all at once from a remote store."""
         return [memoryview(data) for data in self.tree.read_ranges(self.locate(numbers))]
 
-    def decode(self, data: memoryview, number: int, out: NDArray[Any]) -> None:
+    def decode(self, data: memoryview, number: int, out: AnyArray) -> None:
         """Verify a fetched chunk and decode it into `out`."""
         self.encoding.decode(self.verify(data, number), out, self.extra)
 
-    def read_chunk(self, number: int) -> NDArray[Any]:
+    def read_chunk(self, number: int) -> AnyArray:
         """Fetch, verify and decode one chunk."""
         check_size(self.chunk, self.dtype, f"a chunk of {self.name}")
         out = np.empty(self.chunk, self.dtype)
@@ -223,7 +223,7 @@ def crc32c(data: bytes | memoryview, extra: str) -> int:
     return int(import_extra("google_crc32c", extra).value(whole))
 
 
-def scratch(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+def scratch(shape: tuple[int, ...], dtype: np.dtype[Any]) -> AnyArray:
     """Return uninitialised memory of this thread. The next call in the thread reuses it."""
     size = math.prod(shape) * dtype.itemsize
     if _scratch.memory.size < size:
@@ -232,7 +232,7 @@ def scratch(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
 
 
 class _Scratch(threading.local):
-    memory: NDArray[np.uint8] = np.empty(0, np.uint8)
+    memory: Uint8Array = np.empty(0, np.uint8)
 
 
 _scratch = _Scratch()

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, Float32Array, Int32Array
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError
 from carlasc.storage import field_files
@@ -31,7 +31,7 @@ _WIDE_CELLS = {
     "<u4": ("u1", "<u4"),
     "<f4": ("<u2", "<f4"),
 }
-Columns = dict[str, NDArray[Any]]
+Columns = dict[str, AnyArray]
 
 
 @dataclass(frozen=True)
@@ -97,11 +97,11 @@ class Packing(ABC):
     def _columns(self, options: PackOptions) -> tuple[Column, ...]: ...
 
     @abstractmethod
-    def split(self, array: NDArray[Any]) -> Columns:
+    def split(self, array: AnyArray) -> Columns:
         """Return the columns of a frame, without columns that it does not use."""
 
     @abstractmethod
-    def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
+    def join(self, columns: Columns, into: AnyArray | None = None) -> AnyArray:
         """Return the array of a frame, written to `into` if given.
 
         Columns that the frame does not use are empty.
@@ -116,7 +116,7 @@ class Packing(ABC):
         row = np.dtype(self.entry.dtype or BOXES_DTYPE).itemsize * (self.entry.columns or 1)
         return elements * row
 
-    def allocate(self, counts: list[int]) -> list[NDArray[Any] | None]:
+    def allocate(self, counts: list[int]) -> list[AnyArray | None]:
         """Return one array per frame, of `counts` elements, for `join` to write to; None if `join`
         allocates it.
         """
@@ -147,7 +147,7 @@ class PointsPacking(Packing):
             Column("fourth", "<f4", Encoding(shuffle=BITSHUFFLE)),
         )
 
-    def split(self, array: NDArray[Any]) -> Columns:
+    def split(self, array: AnyArray) -> Columns:
         """Return the coordinates as planes, and the 4th column if it has a non-zero bit."""
         xyz = array[:, :3].T
         if scale := self.attributes.get("scale_m"):
@@ -155,7 +155,7 @@ class PointsPacking(Packing):
         fourth = np.ascontiguousarray(array[:, 3], "<f4")
         return {"xyz": xyz} | ({"fourth": fourth} if fourth.view(np.uint32).any() else {})
 
-    def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
+    def join(self, columns: Columns, into: AnyArray | None = None) -> AnyArray:
         """Return (N, 4) float32 rows, as in the published file."""
         xyz, fourth = columns["xyz"], columns["fourth"]
         points = np.empty((xyz.shape[1], 4), np.float32) if into is None else into
@@ -164,12 +164,12 @@ class PointsPacking(Packing):
         points[:, 3] = fourth if fourth.size else 0
         return points
 
-    def to_metres(self, xyz: NDArray[Any]) -> NDArray[np.float32]:
+    def to_metres(self, xyz: AnyArray) -> Float32Array:
         """Return stored coordinates as (3, N) float32 metres."""
         scale = self.attributes.get("scale_m")
         return xyz if scale is None else (xyz * scale).astype(np.float32)
 
-    def allocate(self, counts: list[int]) -> list[NDArray[Any] | None]:
+    def allocate(self, counts: list[int]) -> list[AnyArray | None]:
         """Return the scans of a stack as parts of one block of memory.
 
         The operating system uses large pages for large blocks. The first access to the small pages
@@ -191,11 +191,11 @@ class ValuesPacking(Packing):
         dtype, wide = ("u1", "<u4") if self.entry.kind == "class" else (self.entry.dtype, None)
         return (Column("values", dtype, encoding, self.entry.unit, wide=wide),)
 
-    def split(self, array: NDArray[Any]) -> Columns:
+    def split(self, array: AnyArray) -> Columns:
         """Narrow the values."""
         return {"values": narrow(array)}
 
-    def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
+    def join(self, columns: Columns, into: AnyArray | None = None) -> AnyArray:
         """Return (N,) values in the type of the field; classes in the narrowest type."""
         values = columns["values"]
         return (
@@ -220,11 +220,11 @@ class PairsPacking(Packing):
             ),
         )
 
-    def split(self, array: NDArray[Any]) -> Columns:
+    def split(self, array: AnyArray) -> Columns:
         """Return the columns as planes."""
         return {"values": array.T}
 
-    def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
+    def join(self, columns: Columns, into: AnyArray | None = None) -> AnyArray:
         """Return (N, K) rows."""
         return np.ascontiguousarray(columns["values"].T)
 
@@ -242,7 +242,7 @@ class FlowPacking(Packing):
             "palette", "<f4", encoding, self.entry.unit, rows=3, least=FEW, wide="<f4"
         )
 
-    def split(self, array: NDArray[Any]) -> Columns:
+    def split(self, array: AnyArray) -> Columns:
         """Find the distinct vectors.
 
         Most vectors repeat the previous one, so only the first of each run is compared.
@@ -254,7 +254,7 @@ class FlowPacking(Packing):
         index = np.repeat(of_run.reshape(-1), np.diff(starts, append=len(bits)))
         return {"index": narrow(index.astype(np.uint32)), "palette": palette.view("<f4").T}
 
-    def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
+    def join(self, columns: Columns, into: AnyArray | None = None) -> AnyArray:
         """Return (N, 3) float32."""
         index, palette = columns["index"], columns["palette"]
         if index.size and int(index.max()) >= palette.shape[1]:
@@ -280,7 +280,7 @@ class GridPacking(Packing):
             Column("values", dtype, Encoding(level=8, shuffle=shuffle), self.entry.unit, wide=wide),
         )
 
-    def split(self, array: NDArray[Any]) -> Columns:
+    def split(self, array: AnyArray) -> Columns:
         """Narrow the values, except probabilities: they are rarely integers, and float32 would take
         more space.
         """
@@ -290,7 +290,7 @@ class GridPacking(Packing):
             else narrow(array)
         }
 
-    def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
+    def join(self, columns: Columns, into: AnyArray | None = None) -> AnyArray:
         """Return (X, Y, Z): unsigned integers, float32 if counts are not integers, or float16 for
         probabilities.
         """
@@ -318,11 +318,11 @@ class VotesPacking(Packing):
             + wide * field_files.WIDE_VOTES_DTYPE.itemsize
         )
 
-    def split(self, array: NDArray[Any]) -> Columns:
+    def split(self, array: AnyArray) -> Columns:
         """Return the columns of the table."""
         return {column.name: np.ascontiguousarray(array[column.name]) for column in self.columns}
 
-    def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
+    def join(self, columns: Columns, into: AnyArray | None = None) -> AnyArray:
         """Return the table."""
         wide = columns["label"].dtype.itemsize > 1
         votes = np.empty(
@@ -348,11 +348,11 @@ class VelocitiesPacking(Packing):
         """Return the bytes of tables with this many rows."""
         return counts.get("voxel", 0) * field_files.VELOCITY_DTYPE.itemsize
 
-    def split(self, array: NDArray[Any]) -> Columns:
+    def split(self, array: AnyArray) -> Columns:
         """Return the columns of the table."""
         return {"voxel": np.ascontiguousarray(array["voxel"]), "velocity": array["velocity"].T}
 
-    def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
+    def join(self, columns: Columns, into: AnyArray | None = None) -> AnyArray:
         """Return the table."""
         table = np.empty(len(columns["voxel"]), field_files.VELOCITY_DTYPE)
         table["voxel"], table["velocity"] = columns["voxel"], columns["velocity"].T
@@ -373,14 +373,14 @@ class BoxesPacking(Packing):
             Column("annotated", "u1", encoding, least=FEW),
         )
 
-    def split(self, array: NDArray[Any]) -> Columns:
+    def split(self, array: AnyArray) -> Columns:
         """Return the columns of the table."""
         flat = {
             column.name: np.ascontiguousarray(array[column.name]) for column in self.columns[1:]
         }
         return {"geometry": np.stack([array[name] for name in _GEOMETRY])} | flat
 
-    def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
+    def join(self, columns: Columns, into: AnyArray | None = None) -> AnyArray:
         """Return the table."""
         boxes = np.empty(len(columns["track"]), BOXES_DTYPE)
         for name, row in zip(_GEOMETRY, columns["geometry"], strict=True):
@@ -419,7 +419,7 @@ _BY_KIND: dict[field_files.Kind, Callable[..., Packing]] = {
 }
 
 
-def quantise(metres: NDArray[Any], scale_m: float) -> NDArray[np.int32]:
+def quantise(metres: AnyArray, scale_m: float) -> Int32Array:
     """Return coordinates as integer multiples of `scale_m`.
 
     Raises:
@@ -436,7 +436,7 @@ def quantise(metres: NDArray[Any], scale_m: float) -> NDArray[np.int32]:
     return steps.astype(np.int32)
 
 
-def narrow(array: NDArray[Any]) -> NDArray[Any]:
+def narrow(array: AnyArray) -> AnyArray:
     """Return integers in the smallest unsigned type that holds them, and other numbers as float32,
     bit for bit.
     """

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, IntArray
 from carlasc.core.grids import Coordinates
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.storage import layout
@@ -123,7 +123,7 @@ def _check_root(root: Mapping[str, Any] | None, where: str) -> Mapping[str, str]
 class FieldReader(Protocol):
     """One field of a sequence in a packed store."""
 
-    frames: NDArray[np.int64]
+    frames: IntArray
 
 
 _FieldReader = TypeVar("_FieldReader", bound=FieldReader)
@@ -167,7 +167,7 @@ class PackedSequence(Sequence, Generic[_FieldReader]):
         """Return the fields with at least one frame."""
         return self._fields
 
-    def frames(self, field: str) -> NDArray[np.int64]:
+    def frames(self, field: str) -> IntArray:
         """Return the frames of a field."""
         return self._field(field).frames if field in self._fields else np.empty(0, np.int64)
 
@@ -222,7 +222,7 @@ class FieldWriter(ABC):
         self.entry = layout.field_named(field)
         self.frames: dict[int, None] = {}
 
-    def append(self, frame: int, array: NDArray[Any]) -> None:
+    def append(self, frame: int, array: AnyArray) -> None:
         """Write one frame.
 
         Raises:
@@ -238,7 +238,7 @@ class FieldWriter(ABC):
         self.frames[frame] = None
 
     @abstractmethod
-    def write(self, frame: int, array: NDArray[Any]) -> None:
+    def write(self, frame: int, array: AnyArray) -> None:
         """Write one frame that fits the field."""
 
     @abstractmethod
@@ -279,7 +279,7 @@ class PackedWriter(SequenceWriter):
         """Whether this run has written the frame."""
         return field in self.writers and frame in self.writers[field].frames
 
-    def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
+    def write(self, field: str, frame: int, array: AnyArray) -> None:
         """Append one frame to a field.
 
         Raises:

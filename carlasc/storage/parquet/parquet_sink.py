@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray
 from carlasc.errors import ArgumentError, FormatError, import_extra
 from carlasc.storage import layout
 from carlasc.storage.files import (
@@ -161,7 +161,7 @@ class ParquetWriter(PackedWriter):
     def _start_field(self, field: str) -> FieldWriter:
         return TableWriter(self._folder / f"{field}.parquet", field, self._number, self._options)
 
-    def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
+    def write(self, field: str, frame: int, array: AnyArray) -> None:
         """Append one frame as a row group.
 
         Raises:
@@ -243,7 +243,7 @@ class TableWriter(FieldWriter):
         self.attributes: dict[str, Any] = {}
         self._writer: Any = None
 
-    def write(self, frame: int, array: NDArray[Any]) -> None:
+    def write(self, frame: int, array: AnyArray) -> None:
         """Append one row group. An empty frame has no row group."""
         pa = import_extra("pyarrow", "parquet")
         if self._writer is None:
@@ -257,7 +257,7 @@ class TableWriter(FieldWriter):
             self._file.check()
         self.rows.append(count)
 
-    def _start(self, pa: Any, array: NDArray[Any]) -> None:
+    def _start(self, pa: Any, array: AnyArray) -> None:
         parquet = import_extra("pyarrow.parquet", "parquet")
         self.attributes = {
             "type": "carlasc.table",

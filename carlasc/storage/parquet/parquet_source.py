@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray
 from carlasc.errors import FormatError, MissingDataError, import_extra, reading
 from carlasc.storage import layout
 from carlasc.storage.arrays import check_ratio, check_size
@@ -92,7 +92,7 @@ class ParquetSequence(PackedSequence["FieldTable"]):
         super().__init__(path, tree.where(folder), about)
         self._footers = about.get(FOOTERS)
 
-    def read(self, field: str, frame: int) -> NDArray[Any]:
+    def read(self, field: str, frame: int) -> AnyArray:
         """Read one row group."""
         table = self._field(field)
         per_voxel = layout.field_named(field).per == "voxel"
@@ -160,7 +160,7 @@ class FieldTable:
         groups = np.cumsum(np.array(rows, np.int64) > 0) - 1  # an empty frame has none
         self._groups = dict(zip(frames, zip(groups.tolist(), rows, strict=True), strict=True))
 
-    def read(self, frame: int, shape: tuple[int, ...] | None) -> NDArray[Any]:
+    def read(self, frame: int, shape: tuple[int, ...] | None) -> AnyArray:
         """Read one frame; reshaped to `shape` if given."""
         if frame not in self._groups:
             raise MissingDataError(
@@ -182,7 +182,7 @@ class FieldTable:
             array = join_columns(layout.field_named(self.field), columns, self.attributes)
             return array if shape is None else array.reshape(shape)
 
-    def _read_group(self, frame: int, bounded: bool) -> dict[str, NDArray[Any]]:
+    def _read_group(self, frame: int, bounded: bool) -> dict[str, AnyArray]:
         """Return the columns of a frame.
 
         The numbers of rows and bytes are checked before decompressing.
@@ -336,7 +336,7 @@ def _rise(values: list[int]) -> bool:
     return all(one < other for one, other in itertools.pairwise(values))
 
 
-def _to_numpy(column: Any) -> NDArray[Any]:
+def _to_numpy(column: Any) -> AnyArray:
     """Return a column of a row group, without a copy if it has one chunk and no missing values."""
     return np.asarray(
         column.chunk(0).to_numpy(zero_copy_only=False)

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError
 from carlasc.storage.field_files import VELOCITY_DTYPE, VOTES_DTYPE, WIDE_VOTES_DTYPE, Field
@@ -25,7 +25,7 @@ Otherwise they use byte-stream split, because their values rarely repeat.
 _VELOCITY = ("vx", "vy", "vz")
 
 
-def describe(entry: Field, array: NDArray[Any], scale_m: float | None) -> dict[str, Any]:
+def describe(entry: Field, array: AnyArray, scale_m: float | None) -> dict[str, Any]:
     """Return the attributes that a reader needs in addition to the columns.
 
     Args:
@@ -63,8 +63,8 @@ def column_types(entry: Field, attributes: Mapping[str, Any]) -> dict[str, str]:
 
 
 def split_columns(
-    entry: Field, array: NDArray[Any], attributes: Mapping[str, Any]
-) -> dict[str, NDArray[Any]]:
+    entry: Field, array: AnyArray, attributes: Mapping[str, Any]
+) -> dict[str, AnyArray]:
     """Return the columns of a frame: of a table, of (N, K) rows, of the values of a grid in C
     order, or of one picture.
 
@@ -98,8 +98,8 @@ def split_columns(
 
 
 def join_columns(
-    entry: Field, columns: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]
-) -> NDArray[Any]:
+    entry: Field, columns: Mapping[str, AnyArray], attributes: Mapping[str, Any]
+) -> AnyArray:
     """Return the array of a frame: a table, (N, K) rows, (N,) values (classes in the narrowest
     type), or the bytes of a picture.
     """
@@ -131,7 +131,7 @@ def join_columns(
     return rows
 
 
-def statistics(field: str, array: NDArray[Any]) -> dict[str, Any]:
+def statistics(field: str, array: AnyArray) -> dict[str, Any]:
     """Return the columns of frames.parquet for one frame of a field."""
     if field == "points":
         finite = array[np.isfinite(array).all(axis=1), :3]

@@ -15,8 +15,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import IntArray
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage.arrays import check_ratio
 from carlasc.storage.files import leads_outside
@@ -161,7 +161,7 @@ class _Index:
         limit: offset of the central directory; all members end before it.
     """
 
-    columns: dict[str, NDArray[np.int64]]
+    columns: dict[str, IntArray]
     folders: dict[str, dict[str, int]]
     limit: int
 
@@ -240,7 +240,7 @@ def _find_directory(tree: Tree, path: str) -> tuple[int, int, int]:
     return count, start, size
 
 
-def _walk(data: bytes, count: int, where: str) -> NDArray[np.int64]:
+def _walk(data: bytes, count: int, where: str) -> IntArray:
     """Return the start of each record of the central directory.
 
     Records have different lengths, so each start follows from the previous one.
@@ -263,11 +263,11 @@ def _walk(data: bytes, count: int, where: str) -> NDArray[np.int64]:
     return positions
 
 
-def _columns(data: bytes, positions: NDArray[np.int64], where: str) -> dict[str, NDArray[np.int64]]:
+def _columns(data: bytes, positions: IntArray, where: str) -> dict[str, IntArray]:
     """Return the fixed fields of all records, with the values of 64-bit extra fields."""
     raw = np.frombuffer(data, np.uint8)
 
-    def column(offset: int, width: int) -> NDArray[np.int64]:
+    def column(offset: int, width: int) -> IntArray:
         return sum(
             (raw[positions + offset + i].astype(np.int64) << (8 * i) for i in range(width)),
             np.zeros(len(positions), np.int64),
@@ -293,7 +293,7 @@ def _columns(data: bytes, positions: NDArray[np.int64], where: str) -> dict[str,
     return columns
 
 
-def _widen(columns: dict[str, NDArray[np.int64]], member: int, extra: bytes, where: str) -> None:
+def _widen(columns: dict[str, IntArray], member: int, extra: bytes, where: str) -> None:
     position = 0
     while position + 4 <= len(extra):
         kind, length = struct.unpack_from("<2H", extra, position)
@@ -324,9 +324,7 @@ def _add_folder(folders: dict[str, dict[str, int]], folder: str) -> None:
             return
 
 
-def _names(
-    data: bytes, begins: NDArray[np.int64], columns: dict[str, NDArray[np.int64]]
-) -> list[str]:
+def _names(data: bytes, begins: IntArray, columns: dict[str, IntArray]) -> list[str]:
     """Return the names of the members.
 
     The whole directory is decoded at once; if it is not ASCII, each name separately.

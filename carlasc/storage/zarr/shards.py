@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray
 from carlasc.errors import FormatError, MissingDataError, reading
 from carlasc.storage.files import damaged
 from carlasc.storage.packed.array_layout import FieldLayout
@@ -191,7 +191,7 @@ class ShardIndex:
         return offset, offset + self._lengths[position]
 
 
-def encode_chunk(chunk: NDArray[Any], encoding: Encoding) -> bytes:
+def encode_chunk(chunk: AnyArray, encoding: Encoding) -> bytes:
     """Return the encoded bytes of a chunk, with its checksum."""
     return _with_checksum(encoding.encode(chunk, "zarr"))
 

@@ -12,8 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from numpy.typing import NDArray
-
+from carlasc.core.arrays import AnyArray
 from carlasc.errors import ConflictError, FormatError, MissingDataError
 from carlasc.storage.files import damaged, parse_json, remove_stale, to_json
 from carlasc.storage.packed.array_layout import (
@@ -72,7 +71,7 @@ class StoreNodes:
             self.metadata.setdefault("/".join(parts[:end]), group_metadata({}))
         self.metadata[node] = group_metadata(attributes)
 
-    def small(self, node: str, values: NDArray[Any], attributes: Mapping[str, Any]) -> None:
+    def small(self, node: str, values: AnyArray, attributes: Mapping[str, Any]) -> None:
         """Add an array of one chunk."""
         about = {"version": VERSION, "dtype": values.dtype.name, **attributes}
         chunk = tuple(max(1, n) for n in values.shape)

@@ -10,8 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from numpy.typing import NDArray
-
+from carlasc.core.arrays import AnyArray
 from carlasc.core.grids import Coordinates
 from carlasc.errors import FormatError, import_extra
 from carlasc.storage import layout
@@ -154,13 +153,13 @@ class ZarrWriter(SequenceWriter):
         for field in self._fields.values():
             field.refresh()
 
-    def read(self, field: str, frame: int) -> NDArray[Any] | None:
+    def read(self, field: str, frame: int) -> AnyArray | None:
         """Return an existing frame; None if it does not exist."""
         if frame in self._held.get(field, {}):
             self._flush()
         return self._field(field).read(frame)
 
-    def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
+    def write(self, field: str, frame: int, array: AnyArray) -> None:
         """Write one frame. It is stored together with the other frames of its block."""
         encoded = self._encode({frame: {field: array}})
         if not self._keeps:
@@ -174,7 +173,7 @@ class ZarrWriter(SequenceWriter):
             self._flush()
         self._held.setdefault(field, {}).update(encoded[field])
 
-    def write_frames(self, frames: Mapping[int, Mapping[str, NDArray[Any]]]) -> None:
+    def write_frames(self, frames: Mapping[int, Mapping[str, AnyArray]]) -> None:
         """Write the fields of several frames, block by block."""
         self._flush()
         for block in sorted({frame // self.block for frame in frames}):
@@ -244,7 +243,7 @@ class ZarrWriter(SequenceWriter):
         return self._fields[field]
 
     def _encode(
-        self, frames: Mapping[int, Mapping[str, NDArray[Any]]]
+        self, frames: Mapping[int, Mapping[str, AnyArray]]
     ) -> dict[str, dict[int, EncodedFrame]]:
         """Encode frames in threads, and create new fields."""
         self._start()
@@ -253,7 +252,7 @@ class ZarrWriter(SequenceWriter):
             for frame, fields in frames.items()
             for field, array in fields.items()
         ]
-        arrays: dict[str, list[NDArray[Any]]] = {}
+        arrays: dict[str, list[AnyArray]] = {}
         for name, frame, array in items:
             with _naming(self.location, name, frame):
                 layout.field_named(name).check(array, "its array")
@@ -267,7 +266,7 @@ class ZarrWriter(SequenceWriter):
             for name, found in arrays.items()
         }
 
-        def encode(item: tuple[str, int, NDArray[Any]]) -> EncodedFrame:
+        def encode(item: tuple[str, int, AnyArray]) -> EncodedFrame:
             name, frame, array = item
             with _naming(self.location, name, frame):
                 return encode_frame(layouts[name], array)

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray
 from carlasc.errors import FormatError, MissingDataError, import_extra, reading
 from carlasc.storage.files import damaged, parse_json
 from carlasc.storage.packed.array_source import ArraySource, ArrayStore
@@ -66,7 +66,7 @@ class ZarrStore(ArrayStore):
             return None
         return _mapping(metadata.get("attributes", {}), f"{self.location}/{node}", "attributes")
 
-    def read_small(self, node: str) -> NDArray[Any]:
+    def read_small(self, node: str) -> AnyArray:
         """Return an array of one chunk."""
         array = self.array(node)
         if 0 in array.shape:

@@ -18,8 +18,8 @@ from pathlib import PurePath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, AnyIntArray, LabelArray
 from carlasc.core.geometry import invert, transform_points
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
@@ -32,7 +32,7 @@ from carlasc.viewing.colors import ClassColors
 from carlasc.viewing.photos import encode_photos
 from carlasc.viewing.scene import FrameContent, Scene, SceneReader, SceneSource, find_sequence
 
-Arrays = dict[str, NDArray[Any]]
+Arrays = dict[str, AnyArray]
 
 # positions of a point within its cell, per axis: 2.5 cm in a 0.2 m cell, about the noise of the
 # sensor
@@ -60,7 +60,7 @@ def encode_grid(grid: Grid) -> Arrays:
     return arrays
 
 
-def encode_evidence(grid: Grid, fields: Mapping[str, NDArray[Any]]) -> Arrays:
+def encode_evidence(grid: Grid, fields: Mapping[str, AnyArray]) -> Arrays:
     """Encode the evidence of the occupied voxels of a grid (see `docs/format.md#evidence`).
 
     Args:
@@ -139,7 +139,7 @@ def encode_actors(content: FrameContent, moving: Scan | None, trails: Sequence[T
     return arrays
 
 
-def pack_arrays(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+def pack_arrays(arrays: Mapping[str, AnyArray]) -> bytes:
     """Return named flat arrays as one deflated block.
 
     The block holds the length of a JSON header (uint32, little-endian), the header ([name, type,
@@ -156,13 +156,13 @@ def pack_arrays(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     return zlib.compress(b"".join(parts), 5)  # level 6 takes twice as long for 4 % fewer bytes
 
 
-def _gaps(rising: NDArray[np.integer]) -> NDArray[np.unsignedinteger]:
+def _gaps(rising: AnyIntArray) -> LabelArray:
     """Return the first value and the differences of rising ones, in the narrowest type."""
     values = rising.astype(np.int64)
     return _narrow(np.concatenate([values[:1], values[1:] - values[:-1]]))
 
 
-def _narrow(values: NDArray[np.integer]) -> NDArray[np.unsignedinteger]:
+def _narrow(values: AnyIntArray) -> LabelArray:
     """Return non-negative integers in the narrowest unsigned type of at most 32 bits that holds
     them.
     """

@@ -9,8 +9,15 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import (
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    LabelArray,
+    Uint32Array,
+)
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import Grid, GridSpec
@@ -44,9 +51,9 @@ class Triangles(NamedTuple):
         indices: (T, 3) uint32 rows of `corners`, counter-clockwise seen from outside.
     """
 
-    corners: NDArray[np.float32]
-    normals: NDArray[np.float32]
-    indices: NDArray[np.uint32]
+    corners: Float32Array
+    normals: Float32Array
+    indices: Uint32Array
 
 
 def class_surfaces(grid: Grid) -> Iterator[tuple[int, Triangles]]:
@@ -68,8 +75,8 @@ def class_surfaces(grid: Grid) -> Iterator[tuple[int, Triangles]]:
 
 
 def _faces(
-    spec: GridSpec, labels: NDArray[np.unsignedinteger], axis: int, side: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.unsignedinteger]]:
+    spec: GridSpec, labels: LabelArray, axis: int, side: int
+) -> tuple[Float32Array, Float32Array, LabelArray]:
     """Return the (Q, 4, 3) corners, counter-clockwise seen from outside, the (Q, 3) normals and the
     (Q,) classes of the exposed faces towards one side of one axis. Neighbours become one face.
     """
@@ -79,7 +86,7 @@ def _faces(
     free = np.zeros((*lines.shape[:2], 1), lines.dtype)
     steps = np.diff(lines, axis=2, prepend=free, append=free) != 0
 
-    def cells_of(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    def cells_of(mask: BoolArray) -> IntArray:
         """Return the cells of a mask, line after line."""
         moved = np.argwhere(mask)
         return np.insert(moved[:, :2], along, moved[:, 2], axis=1)
@@ -114,8 +121,8 @@ class RecordedFrame:
     time_s: float
     grids: tuple[Grid, ...]
     scan: Scan | None
-    tails: NDArray[np.float64]
-    vectors: NDArray[np.float64]
+    tails: FloatArray
+    vectors: FloatArray
     boxes: Boxes | None
     pose: Transform | None
     trails: tuple[Trail, ...]
@@ -178,7 +185,7 @@ def thin_scan(scan: Scan, most: int) -> Scan:
     return scan.select(np.sort(np.argpartition(order, most)[:most]))
 
 
-def class_cells(grid: Grid) -> Iterator[tuple[int, NDArray[np.int64]]]:
+def class_cells(grid: Grid) -> Iterator[tuple[int, IntArray]]:
     """Yield each class of a grid with the (K, 3) indices of its voxels."""
     cells = np.argwhere(grid.labels)
     labels = grid.labels[tuple(cells.T)]

@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyFloatArray, FloatArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import Transform, quaternions_of
@@ -69,7 +69,7 @@ class FoxgloveWriter:
         for name, colors in {"classes": reader.colors, **tables}.items():
             names = {str(entry.order): entry.name for entry in colors.entries(colors.table.names)}
             self._writer.write_metadata(name, names)
-        self._path: NDArray[np.float64] | None = reader.path_of_ego()
+        self._path: FloatArray | None = reader.path_of_ego()
 
     def write(self, frame: RecordedFrame) -> None:
         """Append a frame."""
@@ -244,7 +244,7 @@ class FoxgloveWriter:
             ]
             yield entity(track, EGO, cubes=[cube], metadata=metadata)
 
-    def _arrow(self, tail: NDArray[np.float64], vector: NDArray[np.float64]) -> Any:
+    def _arrow(self, tail: FloatArray, vector: FloatArray) -> Any:
         """Return an arrow: in Foxglove it points along the x axis of its pose."""
         length = float(np.linalg.norm(vector))
         ahead = vector / length
@@ -262,7 +262,7 @@ class FoxgloveWriter:
             color=self._rgba(palette.ARROW),
         )
 
-    def _line(self, points: NDArray[np.float64], color: Any) -> Any:
+    def _line(self, points: FloatArray, color: Any) -> Any:
         m = self._messages
         return m.LinePrimitive(
             type=m.LinePrimitiveLineType.LineStrip,
@@ -281,7 +281,7 @@ class FoxgloveWriter:
         w, x, y, z = quaternions_of(dst_T_src[None, :3, :3])[0].tolist()
         return self._messages.Quaternion(x=x, y=y, z=z, w=w)
 
-    def _vector(self, values: NDArray[np.floating]) -> Any:
+    def _vector(self, values: AnyFloatArray) -> Any:
         x, y, z = (float(value) for value in values)
         return self._messages.Vector3(x=x, y=y, z=z)
 

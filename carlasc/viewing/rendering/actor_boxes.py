@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, rotation_z
 from carlasc.core.scans import Scan
@@ -131,7 +131,7 @@ def box_edges(boxes: Boxes) -> QuadMesh:
     return join(bars)
 
 
-def _direction(points: NDArray[np.float64], velocity: NDArray[np.float64]) -> float:
+def _direction(points: FloatArray, velocity: FloatArray) -> float:
     """Return the yaw of an actor, in radians: that of its velocity, or of the rectangle whose sides
     are closest to its points.
 

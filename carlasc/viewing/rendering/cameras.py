@@ -12,15 +12,16 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from carlasc.core.arrays import Float32Array, FloatArray
 from carlasc.core.choices import ViewName
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, rotate_vectors, transform_points
 from carlasc.errors import ArgumentError
 from carlasc.storage.metadata import Axes
 
-Floats = NDArray[np.float64]
+Floats = FloatArray
 
 DEFAULT_ELEVATION_RAD = np.deg2rad(42.0)
 DEFAULT_FOV_RAD = np.deg2rad(32.0)
@@ -188,9 +189,7 @@ class Camera:
     half_height: float
     orthographic: bool = False
 
-    def rays(
-        self, width: int, height: int, rows: slice
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def rays(self, width: int, height: int, rows: slice) -> tuple[Float32Array, Float32Array]:
         """Return origins and directions, (n, 3) float32 each, of the rays through the pixels of
         some rows, row by row.
 

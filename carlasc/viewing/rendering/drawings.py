@@ -6,11 +6,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyArray, AnyFloatArray, BoolArray, FloatArray, IntArray, Uint8Array
 from carlasc.core.choices import GridColor as GridColor  # noqa: PLC0414 (part of this module)
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.core.scans import Scan
@@ -40,7 +40,7 @@ from carlasc.viewing.rendering.meshes import (
 from carlasc.viewing.rendering.raycasting import cast, empty_canvas, splat
 from carlasc.viewing.scene import RemappedSequence, SceneReader, without_invalid_points
 
-Extent = NDArray[np.float64]
+Extent = FloatArray
 """(N, 3) float64 points, metres, that a camera fitted to the drawing shows."""
 
 _FLOOR = (240, 240, 243)
@@ -80,14 +80,12 @@ class Drawing:
 
     extent: Extent
     mesh: QuadMesh | None = None
-    points: NDArray[np.floating] | None = None
-    point_colors: NDArray[np.uint8] | None = None
+    points: AnyFloatArray | None = None
+    point_colors: Uint8Array | None = None
     legend: list[Entry] = field(default_factory=list)
     note: str | None = None
 
-    def render(
-        self, camera: Camera, width: int, height: int, *, axes: Axes = "left"
-    ) -> NDArray[np.uint8]:
+    def render(self, camera: Camera, width: int, height: int, *, axes: Axes = "left") -> Uint8Array:
         """Return the picture, (H, W, 3) uint8, without legend or title.
 
         Args:
@@ -265,8 +263,8 @@ def with_arrows(drawing: Drawing, moving: Scan | None) -> Drawing:
 
 def voxel_drawing(
     spec: GridSpec,
-    voxel_colors: NDArray[np.uint8],
-    occupied: NDArray[np.bool_],
+    voxel_colors: Uint8Array,
+    occupied: BoolArray,
     legend: list[Entry],
     empty: str,
     ego: bool,
@@ -390,7 +388,7 @@ def evidence_legend(color: GridColor) -> list[Entry]:
     ]
 
 
-def _classify(values: NDArray[Any], color: GridColor) -> NDArray[np.int64]:
+def _classify(values: AnyArray, color: GridColor) -> IntArray:
     """Return the entry of the legend for each voxel; for actors the id in `palette.ACTORS`."""
     if color == "inferred":
         seen = np.where(values & VoxelFlag.SEEN_NOW, 0, 1)

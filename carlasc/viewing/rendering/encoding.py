@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import Uint8Array
 from carlasc.errors import ArgumentError, CarlascError, import_extra
 from carlasc.storage.files import write_output
 
@@ -39,7 +39,7 @@ def encodable_size(path: Path, size: tuple[int, int]) -> tuple[int, int]:
 
 
 def write_pictures(
-    path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float, dpi: float | None = None
+    path: Path, pictures: Iterable[Uint8Array], fps: float, dpi: float | None = None
 ) -> None:
     """Write pictures one after the other: the first one into a PNG, all of them into a film.
 
@@ -77,7 +77,7 @@ def write_pictures(
         write_output(path, lambda file: _encode(file, iter(pictures), fps, _ENCODERS[suffix]))
 
 
-def _write_gif(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float) -> None:
+def _write_gif(file: BinaryIO, pictures: Iterator[Uint8Array], fps: float) -> None:
     first, rest = _to_palette(next(pictures)), (_to_palette(picture) for picture in pictures)
     hundredths = max(2, round(100 / fps))  # the unit of the format; viewers slow down below 2
     first.save(
@@ -91,7 +91,7 @@ def _write_gif(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float
     )
 
 
-def _to_palette(picture: NDArray[np.uint8]) -> Any:
+def _to_palette(picture: Uint8Array) -> Any:
     """Return a picture in 256 colours.
 
     Rare colours have a weight above their frequency, so that small objects keep their colour.
@@ -106,7 +106,7 @@ def _to_palette(picture: NDArray[np.uint8]) -> Any:
 
 
 def _encode(
-    file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float, settings: list[str]
+    file: BinaryIO, pictures: Iterator[Uint8Array], fps: float, settings: list[str]
 ) -> None:
     """Encode a film into the file itself, by its name: a killed run leaves no other file, and the
     encoder can seek in it.
@@ -139,9 +139,7 @@ def _encode(
             )
 
 
-def _feed(
-    process: subprocess.Popen[bytes], first: NDArray[np.uint8], rest: Iterator[NDArray[np.uint8]]
-) -> None:
+def _feed(process: subprocess.Popen[bytes], first: Uint8Array, rest: Iterator[Uint8Array]) -> None:
     """Write pictures to the encoder's input.
 
     If the encoder ends early, its exit code is checked by the caller.

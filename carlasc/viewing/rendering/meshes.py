@@ -10,6 +10,14 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from carlasc.core.arrays import (
+    AnyFloatArray,
+    BoolArray,
+    Float32Array,
+    Int32Array,
+    IntArray,
+    Uint8Array,
+)
 from carlasc.core.grids import GridSpec
 
 _Value = TypeVar("_Value", bound=np.generic)
@@ -35,17 +43,17 @@ class QuadMesh:
             for a single value.
     """
 
-    corners: NDArray[np.float32]
-    normals: NDArray[np.float32]
-    colors: NDArray[np.uint8]
-    openness: NDArray[np.float32]
-    edges: NDArray[np.bool_]
-    open_sky: NDArray[np.bool_]
+    corners: Float32Array
+    normals: Float32Array
+    colors: Uint8Array
+    openness: Float32Array
+    edges: BoolArray
+    open_sky: BoolArray
 
     def __len__(self) -> int:
         return len(self.corners)
 
-    def triangles(self) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    def triangles(self) -> tuple[Float32Array, Int32Array]:
         """Return vertices (4 Q, 3) and triangles (2 Q, 3): quad q is triangles 2 q and 2 q + 1."""
         first = 4 * np.arange(len(self), dtype=np.int32)[:, None, None]
         return self.corners.reshape(-1, 3), (
@@ -85,8 +93,8 @@ def quads(
 
 def grid_mesh(
     spec: GridSpec,
-    colors: NDArray[np.uint8],
-    occupied: NDArray[np.bool_],
+    colors: Uint8Array,
+    occupied: BoolArray,
     *,
     on_floor: bool = False,
 ) -> QuadMesh:
@@ -126,7 +134,7 @@ def split_arcs(spec: GridSpec, values: NDArray[_Value]) -> tuple[GridSpec, NDArr
     )
 
 
-def surrounded(spec: GridSpec, occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def surrounded(spec: GridSpec, occupied: BoolArray) -> BoolArray:
     """Return the cells padded by one empty cell on each side; a full turn of azimuth continues on
     its other side.
     """
@@ -137,8 +145,8 @@ def surrounded(spec: GridSpec, occupied: NDArray[np.bool_]) -> NDArray[np.bool_]
 
 
 def exposed_cells(
-    spec: GridSpec, solid: NDArray[np.bool_], axis: int, side: int, on_floor: bool
-) -> NDArray[np.bool_]:
+    spec: GridSpec, solid: BoolArray, axis: int, side: int, on_floor: bool
+) -> BoolArray:
     """Return the (X, Y, Z) solid cells whose face towards one side of one axis is visible.
 
     Args:
@@ -158,8 +166,8 @@ def exposed_cells(
 
 
 def face_corners(
-    spec: GridSpec, first: NDArray[np.int64], last: NDArray[np.int64], axis: int, side: int
-) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    spec: GridSpec, first: IntArray, last: IntArray, axis: int, side: int
+) -> tuple[AnyFloatArray, AnyFloatArray]:
     """Return the (Q, 4, 3) corners and the (Q, 3) outward normals of faces of runs of cells.
 
     Args:
@@ -170,7 +178,7 @@ def face_corners(
         side: 0 for the lower, 1 for the upper side of the cells.
     """
     edges = [spec.edges(a) for a in range(3)]
-    corners: NDArray[np.floating] = np.empty((len(first), 4, 3))
+    corners: AnyFloatArray = np.empty((len(first), 4, 3))
     for number, in_plane in enumerate(SQUARE):
         offset = np.zeros(3, np.int64)
         offset[[axis, (axis + 1) % 3, (axis + 2) % 3]] = side, *in_plane
@@ -186,9 +194,9 @@ def face_corners(
 
 def _faces(
     spec: GridSpec,
-    colors: NDArray[np.uint8],
-    solid: NDArray[np.bool_],
-    cells: NDArray[np.int64],
+    colors: Uint8Array,
+    solid: BoolArray,
+    cells: IntArray,
     axis: int,
     side: int,
     pieces: int,
@@ -214,13 +222,13 @@ def _faces(
 
 
 def _corner_openness(
-    solid: NDArray[np.bool_],
-    front: NDArray[np.int64],
+    solid: BoolArray,
+    front: IntArray,
     across: int,
     along: int,
     first: int,
     second: int,
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """Return the openness of a corner of each face, from the three cells next to it in the layer in
     front of the face.
     """
@@ -234,9 +242,7 @@ def _corner_openness(
     return np.array([1.0, 0.82, 0.68, 0.56], np.float32)[closed]
 
 
-def _drawn_edges(
-    cells: NDArray[np.int64], across: int, along: int, pieces: int
-) -> NDArray[np.bool_]:
+def _drawn_edges(cells: IntArray, across: int, along: int, pieces: int) -> BoolArray:
     """Return which edges of a face are drawn: all except those between the flat pieces of one wide
     wedge.
     """
@@ -251,7 +257,7 @@ def _drawn_edges(
     return drawn
 
 
-def footprint(spec: GridSpec, height: float) -> NDArray[np.float32]:
+def footprint(spec: GridSpec, height: float) -> Float32Array:
     """Return (Q, 4, 3) faces, facing upwards, of the ground plan of a grid at a height, metres."""
     pieces = (1, 1)
     # several along the radius too: Embree is slow with very thin faces
@@ -282,7 +288,7 @@ def box(lower: ArrayLike, upper: ArrayLike, color: ArrayLike, *, taper: float = 
 
 
 def arrows(
-    tails: NDArray[np.floating], vectors: NDArray[np.floating], color: ArrayLike, width: float
+    tails: AnyFloatArray, vectors: AnyFloatArray, color: ArrayLike, width: float
 ) -> QuadMesh:
     """Return arrows: shafts with six sides, and cones.
 

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import Uint8Array
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import rotate_vectors
 from carlasc.errors import ArgumentError, MissingDataError
@@ -89,7 +89,7 @@ def _pictures(
     frames: tuple[int, ...],
     opacity: float,
     size: tuple[int, int],
-) -> Iterator[NDArray[np.uint8]]:
+) -> Iterator[Uint8Array]:
     rows, columns = np.mgrid[: camera.height, : camera.width].reshape(2, -1)
     looks = camera.unproject(np.stack([columns, rows], axis=1))
     looks_somewhere = np.isfinite(looks).all(axis=1)

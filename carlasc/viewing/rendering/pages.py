@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import Uint8Array
 from carlasc.errors import import_extra
 from carlasc.viewing.colors import Entry
 from carlasc.viewing.rendering.styles import check_size
@@ -124,12 +124,12 @@ def plan_page(
 
 def draw_page(
     page: Page,
-    pictures: Sequence[NDArray[np.uint8]],
+    pictures: Sequence[Uint8Array],
     titles: Sequence[str] = (),
     notes: Sequence[str | None] = (),
     *,
     wrapped: bool = False,
-) -> NDArray[np.uint8]:
+) -> Uint8Array:
     """Return the whole picture, (height, width, 3) uint8.
 
     Args:
@@ -353,7 +353,7 @@ def draw_entry(draw: Any, font: Any, size: int, entry: Entry, left: int, middle:
     draw.text((left + swatch + round(size * 0.45), middle), entry.name, INK, font, anchor="lm")
 
 
-def draw_legend(entries: Sequence[Entry], font_size: int, most_width: int) -> NDArray[np.uint8]:
+def draw_legend(entries: Sequence[Entry], font_size: int, most_width: int) -> Uint8Array:
     """Draw a legend alone: entries in rows on white, without a wide margin.
 
     Args:

@@ -10,8 +10,8 @@ from string import ascii_lowercase
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import Uint8Array
 from carlasc.core.geometry import Transform, transform_points
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.storage import layout
@@ -233,7 +233,7 @@ class PictureRenderer:
     captions: tuple[str, ...] = ()
     columns: int | None = None
 
-    def render(self, shot: tuple[Sequence[Cell], Viewpoint]) -> NDArray[np.uint8]:
+    def render(self, shot: tuple[Sequence[Cell], Viewpoint]) -> Uint8Array:
         """Return the picture of some cells from a viewpoint, (H, W, 3) uint8."""
         cells, viewpoint = shot
         panels = [panel for cell in cells for panel in cell.renderer.panels(cell.frame)]

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import Uint8Array
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import Grid
@@ -65,7 +65,7 @@ def draw_panels(
     captioned: bool = False,
     columns: int | None = None,
     font_size: int | None = None,
-) -> NDArray[np.uint8]:
+) -> Uint8Array:
     """Draw panels side by side.
 
     Args:
@@ -132,7 +132,7 @@ def render_grid(
     axes: Axes = "left",
     title: str = "",
     ego: bool = True,
-) -> NDArray[np.uint8]:
+) -> Uint8Array:
     """Draw a voxel grid, without free and unknown voxels.
 
     Args:
@@ -177,7 +177,7 @@ def render_scan(
     ego: bool = True,
     flow: bool = False,
     extent: Extent | None = None,
-) -> NDArray[np.uint8]:
+) -> Uint8Array:
     """Draw the points of a scan, coloured by class (by height if they have no labels), or their
     scene flow.
 
@@ -226,7 +226,7 @@ def render_comparison(
     legend: bool = True,
     axes: Axes = "left",
     ego: bool = True,
-) -> NDArray[np.uint8]:
+) -> Uint8Array:
     """Draw a prediction beside the ground truth and, with `errors`, its errors: right, wrong class,
     missed or invented.
 
@@ -264,9 +264,7 @@ def render_comparison(
     return draw_panels(panels, viewpoint=viewpoint, size=size, legend=legend, axes=axes)
 
 
-def _draw(
-    panel: Panel, page: Page, number: int, viewpoint: Viewpoint, axes: Axes
-) -> NDArray[np.uint8]:
+def _draw(panel: Panel, page: Page, number: int, viewpoint: Viewpoint, axes: Axes) -> Uint8Array:
     box = page.panels[number]
     aspect = box.width / box.height
     extent = panel.drawing.extent if panel.fixed_view is None else panel.fixed_view[0]

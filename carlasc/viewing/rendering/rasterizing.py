@@ -10,17 +10,17 @@ for it with opposite signs, so that no sample is between them.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import Float32Array, Int32Array
 from carlasc.core.compiling import cached, jit
 from carlasc.viewing.rendering.cameras import Camera
 from carlasc.viewing.rendering.meshes import QuadMesh
 
-_Floats = NDArray[np.float32]
+_Floats = Float32Array
 _NEAR_M = 1e-3  # a pinhole camera shows nothing nearer
 
 
-def visible_triangles(mesh: QuadMesh, camera: Camera, width: int, height: int) -> NDArray[np.int32]:
+def visible_triangles(mesh: QuadMesh, camera: Camera, width: int, height: int) -> Int32Array:
     """Return the number of the triangle that each sample shows, (height, width) int32; -1 where
     there is none.
 
@@ -144,9 +144,7 @@ def _cross(a, b):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-def hits(
-    corners: _Floats, triangle: NDArray[np.int32], origins: _Floats, directions: _Floats
-) -> _Floats:
+def hits(corners: _Floats, triangle: Int32Array, origins: _Floats, directions: _Floats) -> _Floats:
     """Return where rays hit given triangles, (3, n): the weights u and v of the second and third
     corner, and the depth.
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyFloatArray, Float32Array, Uint8Array
 from carlasc.core.compiling import cached
 from carlasc.errors import import_extra
 from carlasc.storage.metadata import Axes
@@ -45,10 +45,10 @@ class Canvas:
         depth: (h, w) float32 metres along the camera's axis; infinite where nothing was hit.
     """
 
-    colors: NDArray[np.uint8]
-    depth: NDArray[np.float32]
+    colors: Uint8Array
+    depth: Float32Array
 
-    def resolve(self) -> NDArray[np.uint8]:
+    def resolve(self) -> Uint8Array:
         """Return the picture, (H, W, 3) uint8: the mean of the samples of each pixel."""
         total = np.full(
             (self.depth.shape[0] // SAMPLES, self.depth.shape[1] // SAMPLES, 3), SAMPLES, np.uint16
@@ -130,7 +130,7 @@ def cast(mesh: QuadMesh, camera: Camera, canvas: Canvas, *, axes: Axes = "left")
     del geometry
 
 
-def _suns(axes: Axes) -> NDArray[np.float32]:
+def _suns(axes: Axes) -> Float32Array:
     """Return (SAMPLES^2, 3) unit vectors to points of the sun's disc, behind the vehicle on its
     left.
     """
@@ -142,7 +142,7 @@ def _suns(axes: Axes) -> NDArray[np.float32]:
     return (suns / np.linalg.norm(suns, axis=1, keepdims=True)).astype(np.float32)
 
 
-def _sky_visibility(scene: Any, mesh: QuadMesh) -> NDArray[np.float32]:
+def _sky_visibility(scene: Any, mesh: QuadMesh) -> Float32Array:
     """Return (Q,) visible share of the sky of each face, by rays from its middle with a cosine
     distribution about its normal.
     """
@@ -258,8 +258,8 @@ def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
 
 
 def splat(
-    points: NDArray[np.floating],
-    colors: NDArray[np.uint8],
+    points: AnyFloatArray,
+    colors: Uint8Array,
     camera: Camera,
     canvas: Canvas,
 ) -> None:

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import Uint8Array
 from carlasc.errors import ArgumentError
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
@@ -256,8 +256,8 @@ def _plan_shots(
 
 
 def _reported(
-    pictures: Iterator[NDArray[np.uint8]], total: int, progress: Callable[[int, int], None] | None
-) -> Iterator[NDArray[np.uint8]]:
+    pictures: Iterator[Uint8Array], total: int, progress: Callable[[int, int], None] | None
+) -> Iterator[Uint8Array]:
     step = StepCounter(progress, total)
     for picture in pictures:
         yield picture

@@ -7,9 +7,9 @@ from types import MappingProxyType
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting import remaps_to_carla
+from carlasc.core.arrays import Int32Array, LabelArray
 from carlasc.core.classes import ClassTable
 from carlasc.errors import FormatError
 
@@ -144,7 +144,7 @@ def mapping_of(
     }
 
 
-def lookup_of(mapping: Mapping[int, int]) -> NDArray[np.int32]:
+def lookup_of(mapping: Mapping[int, int]) -> Int32Array:
     """Return a table from ids to classes, -2 for ids without a class; its last entry stands for all
     larger ids.
     """
@@ -153,9 +153,7 @@ def lookup_of(mapping: Mapping[int, int]) -> NDArray[np.int32]:
     return lookup
 
 
-def classes_of(
-    labels: NDArray[np.unsignedinteger], lookup: NDArray[np.int32], table: ClassTable, where: str
-) -> NDArray[np.int32]:
+def classes_of(labels: LabelArray, lookup: Int32Array, table: ClassTable, where: str) -> Int32Array:
     """Return labels as classes of another data set.
 
     Args:
@@ -171,7 +169,7 @@ def classes_of(
         FormatError: a label has no class.
     """
     beyond = len(lookup) - 1
-    classes: NDArray[np.int32] = lookup[
+    classes: Int32Array = lookup[
         labels if np.iinfo(labels.dtype).max <= beyond else np.minimum(labels, beyond)
     ]
     if (classes == _NONE).any():

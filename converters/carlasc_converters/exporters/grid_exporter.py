@@ -9,10 +9,10 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc import storage
 from carlasc.converting import FrameExporter, TargetFrame, is_same, resample_to, resampling_notes
+from carlasc.core.arrays import BoolArray, Float32Array, LabelArray
 from carlasc.core.axes import mirror_points
 from carlasc.core.benchmarks import IGNORED
 from carlasc.core.grids import GridSpec
@@ -122,9 +122,7 @@ class GridExporter(FrameExporter):
         }
         return choose_grid(sequence, grids, self.grid, (self.target, self.frame_of(sequence)))
 
-    def read(
-        self, sequence: storage.Sequence, frame: int
-    ) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_]]:
+    def read(self, sequence: storage.Sequence, frame: int) -> tuple[LabelArray, BoolArray]:
         """Return a frame's grid in the target's voxels and classes: (X, Y, Z) labels, and which
         voxels are known.
 
@@ -136,9 +134,7 @@ class GridExporter(FrameExporter):
         classes[0] = self.free
         return classes[codes], known
 
-    def read_codes(
-        self, sequence: storage.Sequence, frame: int
-    ) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_]]:
+    def read_codes(self, sequence: storage.Sequence, frame: int) -> tuple[LabelArray, BoolArray]:
         """Return the result of `read`, with 0 for free or unknown voxels, else class + 1."""
         name, axes, place = self.grid_of(sequence), sequence.metadata.axes, self.frame_of(sequence)
         grid, table = sequence.grid(name, frame), sequence.classes_of(name)
@@ -150,7 +146,7 @@ class GridExporter(FrameExporter):
             if self.predictions
             else grid.known & (classes != IGNORED)
         )
-        codes: NDArray[np.unsignedinteger] = np.where(classes == self.free, 0, classes + 1).astype(
+        codes: LabelArray = np.where(classes == self.free, 0, classes + 1).astype(
             np.uint16 if lookup.max() > 254 else np.uint8
         )
         return resample_to(
@@ -243,7 +239,7 @@ def sensor_height(sequence: storage.Sequence, given: float | None) -> tuple[floa
     return _CARLASC_HEIGHT_M, storage.layout.METADATA in sequence.documents()
 
 
-def read_points(sequence: storage.Sequence, frame: int) -> NDArray[np.float32]:
+def read_points(sequence: storage.Sequence, frame: int) -> Float32Array:
     """Return (N, 4) right-handed points and remission of a frame; none without a scan."""
     if not np.isin(frame, sequence.frames("points")):
         return np.empty((0, 4), np.float32)
@@ -251,9 +247,7 @@ def read_points(sequence: storage.Sequence, frame: int) -> NDArray[np.float32]:
     return points if sequence.metadata.axes == "right" else mirror_points(points)
 
 
-def scan_occupancy(
-    sequence: storage.Sequence, points: NDArray[np.float32], spec: GridSpec
-) -> NDArray[np.bool_]:
+def scan_occupancy(sequence: storage.Sequence, points: Float32Array, spec: GridSpec) -> BoolArray:
     """Return the voxels that hold a point of a scan.
 
     Args:

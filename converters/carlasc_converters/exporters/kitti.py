@@ -9,10 +9,17 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc import storage
 from carlasc.converting import VOXEL_FILES, Files, FrameExporter
+from carlasc.core.arrays import (
+    AnyFloatArray,
+    AnyIntArray,
+    Float32Array,
+    Int32Array,
+    LabelArray,
+    Uint32Array,
+)
 from carlasc.core.axes import mirror_grid, mirror_poses, mirror_spec
 from carlasc.core.classes import ClassTable
 from carlasc.core.tables import CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
@@ -218,7 +225,7 @@ class KittiExporter(FrameExporter):
             made |= self._voxels(sequence, frame, points)
         return made
 
-    def _point_labels(self, sequence: storage.Sequence, frame: int) -> NDArray[np.integer]:
+    def _point_labels(self, sequence: storage.Sequence, frame: int) -> AnyIntArray:
         """Return (N,) ids of SemanticKITTI: those of moving actors where the class or the flow of a
         point says that it moves.
         """
@@ -242,7 +249,7 @@ class KittiExporter(FrameExporter):
         return labels
 
     def _voxels(
-        self, sequence: storage.Sequence, frame: int, points: NDArray[np.float32]
+        self, sequence: storage.Sequence, frame: int, points: Float32Array
     ) -> Mapping[str, bytes]:
         """Return the original voxel files if they were kept, else files made from the grid."""
         kept = _kept_files(sequence, frame) if self.grid is None else {}
@@ -260,7 +267,7 @@ class KittiExporter(FrameExporter):
         }
         return {f"voxels/{frame:06d}{suffix}": data for suffix, data in files.items()}
 
-    def _labels(self, sequence: storage.Sequence, frame: int) -> NDArray[np.integer]:
+    def _labels(self, sequence: storage.Sequence, frame: int) -> AnyIntArray:
         """Return (X, Y, Z) ids of SemanticKITTI, right-handed."""
         name = self._grid_of(sequence)
         where = f"{sequence.location}: {name} of frame {frame}"
@@ -269,7 +276,7 @@ class KittiExporter(FrameExporter):
         )
         return labels if _is_right_handed(sequence) else mirror_grid(labels)
 
-    def _counts(self, sequence: storage.Sequence, frame: int) -> NDArray[np.floating]:
+    def _counts(self, sequence: storage.Sequence, frame: int) -> AnyFloatArray:
         name = self._grid_of(sequence)
         if frame not in sequence.frames(f"{name}/counts"):
             raise MissingDataError(
@@ -301,9 +308,7 @@ class KittiExporter(FrameExporter):
             for label, raw in mapping_of(TO_PREDICTED, "raw", classes, where).items()
         }
 
-    def _raw_ids(
-        self, classes: ClassTable, labels: NDArray[np.unsignedinteger], where: str
-    ) -> NDArray[np.int32]:
+    def _raw_ids(self, classes: ClassTable, labels: LabelArray, where: str) -> Int32Array:
         """Map class ids to SemanticKITTI's.
 
         Raises:
@@ -313,7 +318,7 @@ class KittiExporter(FrameExporter):
         return classes_of(labels, lookup_of(self._mapping(classes, where)), classes, where)
 
 
-def _instances(sequence: storage.Sequence, frame: int, count: int) -> NDArray[np.uint32]:
+def _instances(sequence: storage.Sequence, frame: int, count: int) -> Uint32Array:
     """Return the (count,) numbers of actors in a frame as SemanticKITTI's files hold them, 0 for
     none.
 

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc import storage
 from carlasc.converting import Exported, Files, TargetFrame, resample_to
+from carlasc.core.arrays import Uint8Array
 from carlasc.core.axes import mirror_poses
 from carlasc.core.benchmarks import TO_OCC3D
 from carlasc.core.geometry import quaternions_of, translation
@@ -118,7 +118,7 @@ class Occ3dExporter(GridExporter):
     def _has_seen(self, sequence: storage.Sequence) -> bool:
         return not self.predictions and f"{self.grid_of(sequence)}/seen" in sequence.fields()
 
-    def _read_seen(self, sequence: storage.Sequence, frame: int) -> NDArray[np.uint8]:
+    def _read_seen(self, sequence: storage.Sequence, frame: int) -> Uint8Array:
         """Return (200, 200, 16) 1 for voxels that any camera sees."""
         name, axes, place = self.grid_of(sequence), sequence.metadata.axes, self.frame_of(sequence)
         seen = place.turn((sequence.read(f"{name}/seen", frame) > 0).astype(np.uint8), axes)

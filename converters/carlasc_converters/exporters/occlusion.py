@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import BoolArray, FloatArray, Int32Array, Uint32Array
 from carlasc.core.compiling import cached
 from carlasc.core.grids import GridSpec
 
@@ -26,8 +26,8 @@ class _Columns(NamedTuple):
         first: (X * Y + 1,) int32, place of the runs of each column in `runs`.
     """
 
-    runs: NDArray[np.int32]
-    first: NDArray[np.int32]
+    runs: Int32Array
+    first: Int32Array
 
 
 class _Heights(NamedTuple):
@@ -45,14 +45,14 @@ class _Heights(NamedTuple):
         down: the other voxels, as bits.
     """
 
-    times: NDArray[np.float64]
-    stages: NDArray[np.int32]
-    below: NDArray[np.uint32]
+    times: FloatArray
+    stages: Int32Array
+    below: Uint32Array
     up: np.uint32
     down: np.uint32
 
 
-def occluded_voxels(occupied: NDArray[np.bool_], spec: GridSpec) -> NDArray[np.bool_]:
+def occluded_voxels(occupied: BoolArray, spec: GridSpec) -> BoolArray:
     """Return the occupied voxels, and the voxels whose line to the sensor passes through an
     occupied one.
 
@@ -82,7 +82,7 @@ def occluded_voxels(occupied: NDArray[np.bool_], spec: GridSpec) -> NDArray[np.b
     return occluded
 
 
-def _columns(occupied: NDArray[np.bool_]) -> _Columns:
+def _columns(occupied: BoolArray) -> _Columns:
     padded = np.pad(occupied, ((0, 0), (0, 0), (1, 1)))
     ends = padded[..., 1:] != padded[..., :-1]
     first = np.append(0, np.cumsum(np.count_nonzero(ends, axis=2)))
@@ -123,9 +123,7 @@ def _heights(lowest: int, count: int, rows: int, sensor: float) -> _Heights:
 
 
 @cached(error_model="python")
-def _occlude(
-    columns: _Columns, sensor: NDArray[np.float64], heights: _Heights, occluded: NDArray[np.bool_]
-) -> None:
+def _occlude(columns: _Columns, sensor: FloatArray, heights: _Heights, occluded: BoolArray) -> None:
     """Walk from every column to the sensor.
 
     Args:
@@ -144,7 +142,7 @@ def _occlude(
 @numba.njit(nogil=True)
 def _walk(
     columns: _Columns,
-    sensor: NDArray[np.float64],
+    sensor: FloatArray,
     heights: _Heights,
     x: int,
     y: int,

@@ -11,13 +11,14 @@ import pickle
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc import storage
 from carlasc.converting import Exported, Files, SequenceExporter, SequenceFile
+from carlasc.core.arrays import AnyArray, Float32Array, LabelArray, Uint32Array
 from carlasc.core.axes import mirror_boxes, mirror_points, mirror_poses
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert, transform_points
@@ -137,7 +138,7 @@ class OpenSceneFlowExporter(SequenceExporter):
                 made[place] = pickle.dumps(entries, _PROTOCOL)
         return made
 
-    def make_frame(self, sequence: storage.Sequence, frame: int) -> dict[str, NDArray[Any]]:
+    def make_frame(self, sequence: storage.Sequence, frame: int) -> dict[str, AnyArray]:
         """Return the arrays of a scan; those of flow only if another scan follows."""
         left = sequence.metadata.axes == "left"
         fields = [
@@ -155,7 +156,7 @@ class OpenSceneFlowExporter(SequenceExporter):
                 )
         points = mirror_points(points) if left else points
         pose = _pose(sequence, frame)
-        made: dict[str, NDArray[Any]] = {
+        made: dict[str, AnyArray] = {
             "lidar": points,
             "lidar_id": read["sensor"].astype(np.uint8)
             if "sensor" in read
@@ -216,12 +217,12 @@ class _Step:
 
     def flow(
         self,
-        points: NDArray[np.float32],
-        velocity: NDArray[np.float32] | None,
-        instances: NDArray[np.unsignedinteger] | None,
+        points: Float32Array,
+        velocity: Float32Array | None,
+        instances: LabelArray | None,
         now: Boxes | None,
         later: Boxes | None,
-    ) -> dict[str, NDArray[Any]]:
+    ) -> dict[str, AnyArray]:
         """Return the displacement of points to the next scan, in its frame, and the points for
         which it is known.
 
@@ -276,7 +277,7 @@ class _LogFile(SequenceFile):
     ) -> None:
         self._file.close()
 
-    def add(self, frame: int, content: Mapping[str, NDArray[Any]]) -> None:
+    def add(self, frame: int, content: Mapping[str, AnyArray]) -> None:
         """Write the group of a scan."""
         arrays = dict(content)
         if "flow_instance_id" in arrays:
@@ -285,7 +286,7 @@ class _LogFile(SequenceFile):
         for name, array in arrays.items():
             group.create_dataset(name, data=array)
 
-    def _number(self, instances: NDArray[np.unsignedinteger]) -> NDArray[np.int16]:
+    def _number(self, instances: LabelArray) -> NDArray[np.int16]:
         actors = np.unique(instances)
         for instance in actors.tolist():
             self._numbers.setdefault(instance, len(self._numbers))
@@ -298,7 +299,7 @@ class _LogFile(SequenceFile):
         ]
 
 
-def _owners(boxes: Boxes, points: NDArray[np.float32]) -> NDArray[np.uint32]:
+def _owners(boxes: Boxes, points: Float32Array) -> Uint32Array:
     """Return (N,) the track of the box that each point is in, 0 for none."""
     rows = boxes.owners(points)
     return np.append(boxes.tracks, np.uint32(0))[rows]

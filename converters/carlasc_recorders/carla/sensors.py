@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.captures.raw import SensorRecording
 from carlasc.captures.settings import BEV_HEIGHT_M, BEV_QUALITY, BEV_SIZE, Lidar
+from carlasc.core.arrays import AnyArray, AnyIntArray, FloatArray, Uint8Array, Uint32Array
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import invert, rotate_vectors
 from carlasc.core.scans import Scan
@@ -46,7 +46,7 @@ class SensorRig:
         self,
         server: Server,
         ego: Any,
-        offsets: NDArray[np.float64],
+        offsets: FloatArray,
         lidar: Lidar,
         bev: bool,
         seed: int,
@@ -103,7 +103,7 @@ class SensorRig:
 
     def measure(
         self, tick: int, frame: int, numbers: ActorNumbers
-    ) -> tuple[list[SensorRecording], list[float], bytes | None, dict[str, NDArray[np.uint8]]]:
+    ) -> tuple[list[SensorRecording], list[float], bytes | None, dict[str, Uint8Array]]:
         """Collect the measurements of a tick.
 
         Args:
@@ -144,7 +144,7 @@ class SensorRig:
         return recordings, [sweep.elapsed_s for sweep in sweeps], picture, photos
 
     def _mount_camera(
-        self, ego: Any, camera: CameraModel, ego_lidar: NDArray[np.float64], kind: str
+        self, ego: Any, camera: CameraModel, ego_lidar: FloatArray, kind: str
     ) -> queue.Queue[Any]:
         """Spawn a camera of CARLA at the pose of a camera model, and return the queue of its
         images.
@@ -157,7 +157,7 @@ class SensorRig:
         where = self._server.transform((x, y, z), yaw_deg=yaw_deg)
         return self._mount(ego, f"sensor.camera.{kind}", attributes, where)
 
-    def _to_file(self, field: str, image: Any) -> NDArray[np.uint8]:
+    def _to_file(self, field: str, image: Any) -> Uint8Array:
         """Return an image as the bytes of a file: colours, class ids, or depths, which CARLA
         encodes in three channels.
         """
@@ -173,7 +173,7 @@ class SensorRig:
             np.rint(shares * _FARTHEST_M * _DEPTH_STEP).clip(1, 65535).astype(np.uint16), "PNG"
         )
 
-    def _classes_of(self, tags: NDArray[Any], sensor: str) -> NDArray[Any]:
+    def _classes_of(self, tags: AnyArray, sensor: str) -> AnyArray:
         """Return the class ids of the data set for those of the server."""
         where = f"CARLA {self._server.version}, {sensor}"
         if self._remap is not None:
@@ -232,7 +232,7 @@ class ActorNumbers:
         """
         self._numbers = {0: 0} | {actor: number for number, actor in enumerate(actors, 1)}
 
-    def of(self, actors: NDArray[np.integer]) -> NDArray[np.uint32]:
+    def of(self, actors: AnyIntArray) -> Uint32Array:
         """Return (N,) numbers for (N,) ids of actors. A new actor gets the next number."""
         ids, position = np.unique(actors, return_inverse=True)
         numbers = [self._numbers.setdefault(int(actor), len(self._numbers)) for actor in ids]
@@ -248,7 +248,7 @@ def encode_bev(image: Any) -> bytes:
     return encode_image(_rgb(image), "JPEG", BEV_QUALITY).tobytes()
 
 
-def _rgb(image: Any) -> NDArray[np.uint8]:
+def _rgb(image: Any) -> Uint8Array:
     """Return the (H, W, 3) pixels of a `carla.Image`, which are BGRA."""
     pixels = np.frombuffer(bytes(image.raw_data), np.uint8).reshape(
         int(image.height), int(image.width), 4

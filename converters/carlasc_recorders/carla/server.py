@@ -16,9 +16,9 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.captures.settings import ServerOptions
+from carlasc.core.arrays import AnyIntArray, FloatArray, RecordArray
 from carlasc.core.geometry import Transform
 from carlasc.errors import ArgumentError, CarlascError, FormatError, import_extra
 from carlasc.storage.layout import FRAME_PERIOD_S
@@ -45,7 +45,7 @@ class SemanticSweep:
         elapsed_s: simulation time, seconds.
     """
 
-    detections: NDArray[np.void]
+    detections: RecordArray
     world_T_sensor: Transform
     elapsed_s: float
 
@@ -235,7 +235,7 @@ class Server:
                     advice="check that no other client advances this server",
                 )
 
-    def velocities(self, actors: NDArray[np.integer]) -> NDArray[np.float64]:
+    def velocities(self, actors: AnyIntArray) -> FloatArray:
         """Return (K, 3) velocities of actors after the last tick, m/s, world frame; zero for actors
         that no longer exist.
         """

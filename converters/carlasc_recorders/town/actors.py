@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.captures.settings import TRAFFIC, TrafficLevel
+from carlasc.core.arrays import FloatArray
 from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.errors import check_choice
 from carlasc.storage.layout import FRAME_PERIOD_S
@@ -45,7 +45,7 @@ class Walk:
         heading_rad: heading of a pedestrian who stands.
     """
 
-    loop: NDArray[np.float64]
+    loop: FloatArray
     start_m: float
     speed_mps: float
     heading_rad: float = 0.0
@@ -113,7 +113,7 @@ class TownActor:
 
     id: int
     world_T_actor: Transform
-    velocity: NDArray[np.float64]
+    velocity: FloatArray
     mesh: Mesh
 
 

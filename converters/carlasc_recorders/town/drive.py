@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.captures.raw import SensorRecording
 from carlasc.captures.settings import (
@@ -21,6 +20,7 @@ from carlasc.captures.settings import (
     check_at_least,
     sensor_offsets,
 )
+from carlasc.core.arrays import FloatArray, Uint32Array
 from carlasc.core.geometry import Transform, invert, rotate_vectors, transform_points, translation
 from carlasc.core.scans import Scan
 from carlasc_recorders.town.actors import EGO_ID, Population, TownActor
@@ -54,7 +54,7 @@ class Snapshot:
     world_T_ego: Transform
     actors: dict[int, TownActor]
     mesh: Mesh
-    instances: NDArray[np.uint32]
+    instances: Uint32Array
     scene: RayScene
 
 
@@ -111,7 +111,7 @@ class TownDrive:
         check_at_least(0, frame=frame)
         return self._population.at(frame)
 
-    def sensor_offsets(self, sensors: int) -> NDArray[np.float64]:
+    def sensor_offsets(self, sensors: int) -> FloatArray:
         """Return the (S, 3) offsets of the sensors in the vehicle frame, metres, the ego sensor
         first.
 
@@ -123,7 +123,7 @@ class TownDrive:
         check_at_least(1, sensors=sensors)
         return sensor_offsets(sensors, self._random(_SENSORS))
 
-    def sensor_poses(self, frame: int, sensors: int) -> NDArray[np.float64]:
+    def sensor_poses(self, frame: int, sensors: int) -> FloatArray:
         """Return world_T_sensor of each sensor, shape (S, 4, 4).
 
         The sensors have the orientation of the vehicle.
@@ -191,7 +191,7 @@ class TownDrive:
                 recordings.append(scan_snapshot(self.snapshot(frame), pose, self.lidar, rng))
         return recordings
 
-    def is_free(self, frame: int, point: NDArray[np.float64]) -> bool:
+    def is_free(self, frame: int, point: FloatArray) -> bool:
         """Whether a point (3,) of the world is outside all buildings and actors, with a margin."""
         for footprint, height in self.town.buildings:
             # the roof is within these 4 m
@@ -234,7 +234,7 @@ class TownDrive:
         return Snapshot(frame, ego, actors, mesh, instances, RayScene(mesh, ego[:3, 3]))
 
     @cached_property
-    def _extents(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _extents(self) -> tuple[FloatArray, FloatArray]:
         """Minimum and maximum x and y of each triangle of the static town, (F, 2) each."""
         corners = self.town.mesh.triangles[..., :2]
         return corners.min(axis=1), corners.max(axis=1)
@@ -271,8 +271,8 @@ def scan_snapshot(
 
 
 def _velocities(
-    snapshot: Snapshot, world_T_sensor: Transform, instances: NDArray[np.uint32]
-) -> NDArray[np.float64]:
+    snapshot: Snapshot, world_T_sensor: Transform, instances: Uint32Array
+) -> FloatArray:
     """Return (K, 4) id and velocity over ground, m/s, sensor frame, of every actor that was hit."""
     hit = np.unique(instances[instances != 0])
     velocities = np.array([snapshot.actors[int(id)].velocity for id in hit]).reshape(-1, 3)

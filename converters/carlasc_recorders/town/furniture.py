@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray
 from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.core.tables import CARLA
 from carlasc_recorders.town.meshes import Mesh, MeshBuilder
@@ -146,12 +146,12 @@ def kiosk() -> Mesh:
     return builder.build()
 
 
-def _post_places(length_m: float, spacing_m: float) -> NDArray[np.float64]:
+def _post_places(length_m: float, spacing_m: float) -> FloatArray:
     """Return (P,) x of posts, about a spacing apart, from one end of an object to the other."""
     return np.linspace(-length_m / 2, length_m / 2, max(int(length_m / spacing_m), 1) + 1)
 
 
-def _row(x: NDArray[np.float64], z: float) -> NDArray[np.float64]:
+def _row(x: FloatArray, z: float) -> FloatArray:
     """Return (P, 3) points on a line along x, at a height z."""
     return np.column_stack([x, 0 * x, 0 * x + z])
 

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from carlasc.core.arrays import AnyIntArray, BoolArray, FloatArray, Int32Array, IntArray, Uint8Array
 from carlasc.core.geometry import Transform, transform_points
 from carlasc.errors import import_extra
 
-Vertices = NDArray[np.float64]
-Faces = NDArray[np.int32]
+Vertices = FloatArray
+Faces = Int32Array
 
 
 @dataclass(frozen=True)
@@ -28,13 +29,13 @@ class Mesh:
 
     vertices: Vertices
     faces: Faces
-    labels: NDArray[np.uint8]
+    labels: Uint8Array
 
     def transformed(self, dst_T_src: Transform) -> Mesh:
         """Return the mesh in the frame `dst`."""
         return Mesh(transform_points(dst_T_src, self.vertices), self.faces, self.labels)
 
-    def select(self, keep: NDArray[np.bool_]) -> Mesh:
+    def select(self, keep: BoolArray) -> Mesh:
         """Return the mesh of the triangles selected by a mask (F,), without unused vertices."""
         faces = self.faces[keep]
         used = np.zeros(len(self.vertices), np.bool_)
@@ -43,7 +44,7 @@ class Mesh:
         return Mesh(self.vertices[used], renumbered[faces], self.labels[keep])
 
     @property
-    def triangles(self) -> NDArray[np.float64]:
+    def triangles(self) -> FloatArray:
         """(F, 3, 3) corners of each triangle."""
         return self.vertices[self.faces]
 
@@ -211,12 +212,12 @@ def concatenate(meshes: list[Mesh]) -> Mesh:
     )
 
 
-def close_loop(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def close_loop(points: FloatArray) -> FloatArray:
     """Return the (P, k) points of a loop with the first point repeated at the end."""
     return np.concatenate([points, points[:1]])
 
 
-def at_height(points: NDArray[np.float64], height: ArrayLike) -> NDArray[np.float64]:
+def at_height(points: FloatArray, height: ArrayLike) -> FloatArray:
     """Return (P, 3) points from their x and y, (P, 2), and their z, () or (P,)."""
     return np.column_stack(
         [points, np.broadcast_to(np.asarray(height, np.float64), (len(points),))]
@@ -224,13 +225,13 @@ def at_height(points: NDArray[np.float64], height: ArrayLike) -> NDArray[np.floa
 
 
 @cache
-def unit_sphere(subdivisions: int = 1) -> tuple[Vertices, NDArray[np.int64]]:
+def unit_sphere(subdivisions: int = 1) -> tuple[Vertices, IntArray]:
     """Return vertices and faces of an icosphere of radius 1."""
     sphere = _trimesh_creation().icosphere(subdivisions=subdivisions)
     return np.asarray(sphere.vertices), np.asarray(sphere.faces)
 
 
-def _rotate_z(points: NDArray[np.float64], yaw_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rotate_z(points: FloatArray, yaw_rad: FloatArray) -> FloatArray:
     """Rotate points (N, P, 3) about z, x towards y, by (N,) angles."""
     cos, sin = np.cos(yaw_rad)[:, None], np.sin(yaw_rad)[:, None]
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
@@ -242,14 +243,14 @@ def _trimesh_creation() -> Any:
 
 
 @cache
-def _unit_box() -> tuple[Vertices, NDArray[np.int64]]:
+def _unit_box() -> tuple[Vertices, IntArray]:
     """Return corners and faces of a cube of 1 m whose lower face is at z = 0."""
     box = _trimesh_creation().box(extents=(1, 1, 1))
     return np.asarray(box.vertices) + (0, 0, 0.5), np.asarray(box.faces)
 
 
 @cache
-def _unit_cylinder(sections: int) -> tuple[Vertices, NDArray[np.int64]]:
+def _unit_cylinder(sections: int) -> tuple[Vertices, IntArray]:
     """Return vertices and faces of a cylinder of radius and height 1 m whose lower face is at z =
     0.
     """
@@ -262,7 +263,7 @@ _EDGE_ON = (
 )
 
 
-def rotate_exactly(dst_T_src: Transform, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotate_exactly(dst_T_src: Transform, vectors: FloatArray) -> FloatArray:
     """Rotate (N, 3) vectors from frame `src` to `dst`.
 
     Unlike a matrix product, the result has the same bits with any number of threads.
@@ -274,7 +275,7 @@ def rotate_exactly(dst_T_src: Transform, vectors: NDArray[np.float64]) -> NDArra
 class RayScene:
     """A mesh for ray casting. Coordinates are in the frame of the mesh."""
 
-    def __init__(self, mesh: Mesh, centre: NDArray[np.float64]) -> None:
+    def __init__(self, mesh: Mesh, centre: FloatArray) -> None:
         """Build the search tree.
 
         Args:
@@ -297,8 +298,8 @@ class RayScene:
         self._offsets = np.einsum("fi,fi->f", self._normals, triangles[:, 0])
 
     def cast(
-        self, origin: NDArray[np.float64], directions: NDArray[np.float64], range_m: float
-    ) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.float64]]:
+        self, origin: FloatArray, directions: FloatArray, range_m: float
+    ) -> tuple[NDArray[np.intp], Int32Array, FloatArray]:
         """Cast rays from one point.
 
         Args:
@@ -330,6 +331,6 @@ class RayScene:
         valid = (np.abs(slope) > _EDGE_ON) & (distances > 0) & (distances <= range_m)
         return rays[valid], triangles[valid], distances[valid]
 
-    def normals(self, triangles: NDArray[np.integer]) -> NDArray[np.float64]:
+    def normals(self, triangles: AnyIntArray) -> FloatArray:
         """Return (H, 3) unit normals of triangles, which may point to either side."""
         return self._normals[triangles]

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Sequence
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyIntArray, FloatArray, LabelArray, Uint8Array
 from carlasc.core.cameras import CameraModel, optical_axes
 from carlasc.core.geometry import Transform
 from carlasc.core.tables import CARLA
@@ -90,7 +90,7 @@ def photo_fields(
 
 def photograph(
     snapshot: Snapshot, cameras: Sequence[CameraModel], world_T_sensor: Transform
-) -> dict[str, NDArray[np.uint8]]:
+) -> dict[str, Uint8Array]:
     """Return the bytes of the images of some cameras by field. The ego vehicle is not in them.
 
     Args:
@@ -104,7 +104,7 @@ def photograph(
     others = snapshot.instances != EGO_ID
     mesh, instances = snapshot.mesh.select(others), snapshot.instances[others]
     scene = RayScene(mesh, snapshot.world_T_ego[:3, 3])
-    files: dict[str, NDArray[np.uint8]] = {}
+    files: dict[str, Uint8Array] = {}
     for camera in cameras:
         world_T_camera = world_T_sensor @ camera.sensor_T_camera
         rows, columns = np.mgrid[: camera.height, : camera.width].reshape(2, -1)
@@ -120,7 +120,7 @@ def photograph(
         )
         classes[hit], actors[hit] = labels, instances[triangles]
         depths[hit] = np.rint(distances * looks[hit, 2] * _DEPTH_STEP).clip(1, 65535)
-        layers: tuple[NDArray[np.unsignedinteger], ...] = (
+        layers: tuple[LabelArray, ...] = (
             color.reshape(*shape, 3),
             classes,
             actors,
@@ -136,10 +136,10 @@ def photograph(
 
 def shaded_colors(
     scene: RayScene,
-    triangles: NDArray[np.integer],
-    labels: NDArray[np.uint8],
-    rays: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    triangles: AnyIntArray,
+    labels: Uint8Array,
+    rays: FloatArray,
+) -> FloatArray:
     """Return (H, 3) colours of the classes of triangles in the light of the sun, 0 to 255.
 
     Args:

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import BoolArray, FloatArray
 from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.core.tables import CARLA
 from carlasc_recorders.town.meshes import Mesh, MeshBuilder
@@ -119,8 +119,8 @@ def hedge(rng: np.random.Generator, length_m: float) -> Mesh:
 def _add_leaves(
     builder: MeshBuilder,
     rng: np.random.Generator,
-    centre: NDArray[np.float64],
-    radii: NDArray[np.float64],
+    centre: FloatArray,
+    radii: FloatArray,
     count: int,
     size: tuple[float, float],
 ) -> None:
@@ -145,8 +145,8 @@ def _add_leaves(
 def _add_leaf_triangles(
     builder: MeshBuilder,
     rng: np.random.Generator,
-    positions: NDArray[np.float64],
-    sizes: NDArray[np.float64],
+    positions: FloatArray,
+    sizes: FloatArray,
 ) -> None:
     """Add a randomly oriented triangle of a given size, (N,), at each position, (N, 3)."""
     corners = rng.normal(size=(len(positions), 3, 3))
@@ -161,7 +161,7 @@ def _add_leaf_triangles(
     )
 
 
-Points = NDArray[np.float64]
+Points = FloatArray
 
 
 @dataclass(frozen=True)
@@ -188,11 +188,11 @@ class Rectangle:
         """Return points (..., 2) in the frame of the rectangle, relative to its centre."""
         return (points - self.centre) @ self.axes.T
 
-    def contains(self, points: Points, margin_m: float = 0.0) -> NDArray[np.bool_]:
+    def contains(self, points: Points, margin_m: float = 0.0) -> BoolArray:
         """Return (...) bool: whether points (..., 2) are inside the rectangle, enlarged by a
         margin.
         """
-        inside: NDArray[np.bool_] = np.abs(self.local(points)) <= np.array(self.size) / 2 + margin_m
+        inside: BoolArray = np.abs(self.local(points)) <= np.array(self.size) / 2 + margin_m
         return np.asarray(inside.all(axis=-1))
 
     @cached_property
@@ -293,7 +293,7 @@ class TownPlan:
     parking: list[Transform] = field(default_factory=list)
 
     def add(
-        self, mesh: Mesh, position: NDArray[np.float64], yaw_rad: float, height_m: float = KERB_M
+        self, mesh: Mesh, position: FloatArray, yaw_rad: float, height_m: float = KERB_M
     ) -> None:
         """Add an object.
 

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.captures.raw import SensorRecording
 from carlasc.captures.settings import BEV_HEIGHT_M, BEV_QUALITY, BEV_SIZE, Lidar, TrafficLevel
 from carlasc.captures.simulation import Simulator
+from carlasc.core.arrays import FloatArray, Uint8Array
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import Transform, rotate_vectors
 from carlasc.errors import import_extra
@@ -49,7 +49,7 @@ def render_birdseye(snapshot: Snapshot) -> bytes:
     return buffer.getvalue()
 
 
-def _downward_rays() -> NDArray[np.float64]:
+def _downward_rays() -> FloatArray:
     """Return (H, W, 3) rays of a camera that looks down.
 
     Its upper edge is ahead, its right edge on the right.
@@ -74,7 +74,7 @@ class SimulatedCapture(Simulator):
         self.check_frame(frame)
         return self._drive.record(frame, sensor)
 
-    def read_velocities(self, frame: int) -> dict[int, NDArray[np.float64]]:
+    def read_velocities(self, frame: int) -> dict[int, FloatArray]:
         """Return the (3,) velocity over ground, m/s, world frame, of each actor of the town in a
         frame.
         """
@@ -107,7 +107,7 @@ class SimulatedCapture(Simulator):
         """Return the layout names of the images of a frame."""
         return photo_fields(self.cameras.values())
 
-    def read_images(self, frame: int) -> dict[str, NDArray[np.uint8]]:
+    def read_images(self, frame: int) -> dict[str, Uint8Array]:
         """Return the image files of a frame as bytes, by their layout names."""
         if not self.cameras:
             return {}

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-Points = NDArray[np.float64]
+from carlasc.core.arrays import FloatArray, IntArray
+
+Points = FloatArray
 
 LANE_WIDTH_M = 3.5
 HALF_ROAD_M = LANE_WIDTH_M  # a road has two lanes, one per direction
@@ -118,7 +119,7 @@ class Lane:
     exits: tuple[int, ...] = ()
 
     @cached_property
-    def stations(self) -> NDArray[np.float64]:
+    def stations(self) -> FloatArray:
         """(P,) distance of each point from the start, metres."""
         steps = np.linalg.norm(np.diff(self.path, axis=0), axis=1)
         return np.concatenate([[0.0], np.cumsum(steps)])
@@ -128,7 +129,7 @@ class Lane:
         """Length of the path."""
         return float(self.stations[-1])
 
-    def point(self, along_m: float | NDArray[np.float64]) -> Points:
+    def point(self, along_m: float | FloatArray) -> Points:
         """Return the point (2,), or the points (N, 2), at a distance from the start."""
         x = np.interp(along_m, self.stations, self.path[:, 0])
         y = np.interp(along_m, self.stations, self.path[:, 1])
@@ -154,7 +155,7 @@ class Streets:
     """
 
     nodes: Points
-    edges: NDArray[np.int64]
+    edges: IntArray
     blocks: tuple[CityBlock, ...]
     lanes: tuple[Lane, ...]
 
@@ -180,9 +181,7 @@ def draw_streets(rng: np.random.Generator, rows: int = 5, columns: int = 5) -> S
     return Streets(nodes, edges, tuple(blocks), _make_lanes(nodes, edges, stop_distances))
 
 
-def _draw_grid(
-    rng: np.random.Generator, rows: int, columns: int
-) -> tuple[Points, NDArray[np.int64]]:
+def _draw_grid(rng: np.random.Generator, rows: int, columns: int) -> tuple[Points, IntArray]:
     xs = np.concatenate([[0.0], np.cumsum(rng.uniform(62, 88, rows - 1))])
     ys = np.concatenate([[0.0], np.cumsum(rng.uniform(58, 80, columns - 1))])
     nodes = np.stack(np.meshgrid(xs - xs.mean(), ys - ys.mean(), indexing="ij"), axis=-1).reshape(
@@ -211,7 +210,7 @@ def _draw_grid(
     return nodes, np.array(edges, np.int64)
 
 
-def _trace_faces(nodes: Points, edges: NDArray[np.int64]) -> list[list[int]]:
+def _trace_faces(nodes: Points, edges: IntArray) -> list[list[int]]:
     """Return the loop of nodes around each face of the network. The face is on the right."""
     neighbours: dict[int, list[int]] = {node: [] for node in range(len(nodes))}
     for a, b in edges.tolist():
@@ -310,7 +309,7 @@ def _rounded_corner(
 
 
 def _make_lanes(
-    nodes: Points, edges: NDArray[np.int64], stop_distances: dict[tuple[int, int], float]
+    nodes: Points, edges: IntArray, stop_distances: dict[tuple[int, int], float]
 ) -> tuple[Lane, ...]:
     lanes: list[Lane] = []
     for a, b in edges.tolist():

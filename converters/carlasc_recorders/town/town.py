@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray
 from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.core.tables import CARLA
 from carlasc_recorders.town import furniture
@@ -96,7 +96,7 @@ def _paint_line(
     plan.builder.level_rectangles(ROAD_LINE, at_height(middles, PAINT_M), sizes, side.yaw_rad)
 
 
-def lay_sidewalk(plan: TownPlan, block: CityBlock) -> NDArray[np.float64]:
+def lay_sidewalk(plan: TownPlan, block: CityBlock) -> FloatArray:
     """Add the kerb and sidewalk around a block. Return the (K, 2) loop behind the sidewalk."""
     kerb, inner = close_loop(block.outline.at(HALF_ROAD_M)), block.outline.at(INNER_M)
     plan.builder.ribbon(SIDEWALK, at_height(kerb, -0.05), at_height(kerb, KERB_M))
@@ -104,7 +104,7 @@ def lay_sidewalk(plan: TownPlan, block: CityBlock) -> NDArray[np.float64]:
     return inner
 
 
-def lay_ground(plan: TownPlan, loop: NDArray[np.float64], label: int) -> None:
+def lay_ground(plan: TownPlan, loop: FloatArray, label: int) -> None:
     """Add the land inside a loop as rings towards its centre. Terrain is slightly uneven.
 
     Args:

@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import BoolArray, FloatArray
 from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc_recorders.town.streets import Lane, Streets
@@ -48,7 +48,7 @@ class Vehicle:
 
     length_m: float
     cruise_mps: float
-    turns: NDArray[np.float64]
+    turns: FloatArray
     route: list[int]
     starts: list[float]
     along_m: float
@@ -85,7 +85,7 @@ class Traffic:
         self._along = [np.array([vehicle.along_m for vehicle in vehicles])]
         self._speed = [np.array([vehicle.speed_mps for vehicle in vehicles])]
 
-    def at(self, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def at(self, frame: int) -> tuple[FloatArray, FloatArray]:
         """Return the distance along its route, (V,) metres, and the speed, (V,) m/s, of every
         vehicle in a frame.
         """
@@ -106,7 +106,7 @@ class Traffic:
         middle, ahead = (front + rear) / 2, front - rear
         return translation((*middle, 0.0)) @ rotation_z(float(np.arctan2(ahead[1], ahead[0])))
 
-    def _point(self, vehicle: Vehicle, along_m: float) -> NDArray[np.float64]:
+    def _point(self, vehicle: Vehicle, along_m: float) -> FloatArray:
         leg = int(np.searchsorted(vehicle.starts, along_m, side="right")) - 1
         leg = min(max(leg, 0), len(vehicle.route) - 1)
         lane, local = self.streets.lanes[vehicle.route[leg]], along_m - vehicle.starts[leg]
@@ -311,7 +311,7 @@ def _speed_limit(lane: Lane) -> float:
     return float(np.sqrt(LATERAL_ACCELERATION * lane.length_m / lane.turning_rad))
 
 
-def _find_conflicts(streets: Streets) -> NDArray[np.bool_]:
+def _find_conflicts(streets: Streets) -> BoolArray:
     """Return (L, L) bool: whether two turns of one crossing are closer than CLEARANCE_M."""
     conflicts = np.zeros((len(streets.lanes),) * 2, np.bool_)
     turns = [(index, lane) for index, lane in enumerate(streets.lanes) if lane.turn]
