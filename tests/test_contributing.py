@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.datasets.sequences import scan
-from helpers.refusals import refused
+from helpers.errors import raises
 
 import carlasc
 from carlasc import Run
@@ -102,7 +102,7 @@ def test_a_scan_keeps_it_with_its_points(folder):
     few = whole.select(np.array([3, 5]))
     assert np.array_equal(few.others["rings"], whole.others["rings"][[3, 5]])
     assert sequence.scan(1, fields=("labels",)).others == {}
-    with refused(FormatError, where="rings", expected="41", found="40"):
+    with raises(FormatError, where="rings", expected="41", found="40"):
         carlasc.Scan(whole.points, others={"rings": whole.others["rings"][:-1]})
 
 

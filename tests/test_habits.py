@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.datasets.drives import write_drive, write_world
-from helpers.refusals import refused
+from helpers.errors import raises
 
 import carlasc
 from carlasc import Dataset, Grid, GridSpec, Scan
@@ -47,7 +47,7 @@ def test_a_source_is_a_mapping_of_paths(world):
         == [path for path, _ in source.items()]
         == list(source)
     )
-    with refused(MissingDataError, expected="Town99", found="Train/Town01_Light") as raised:
+    with raises(MissingDataError, expected="Town99", found="Train/Town01_Light") as raised:
         source["Town99"]
     assert isinstance(raised.value, KeyError)
     assert source == source  # noqa: PLR0124
@@ -98,7 +98,7 @@ def test_a_slice_of_a_data_set_holds_the_samples_of_the_slice(world, chosen):
 
 
 def test_a_slice_backwards_is_one_line(world):
-    with refused(ArgumentError, where="index", expected="1 or more", found="-1"):
+    with raises(ArgumentError, where="index", expected="1 or more", found="-1"):
         Dataset(world, "train")[::-1]
 
 
@@ -139,7 +139,7 @@ def test_frames_are_taken_as_python_says_them(given, chosen):
     "wrong", [3, 2.5, slice(0, 9, 2), [1.5], [], range(0), "a:b", (1, 2, 3), {"a": 1}], ids=str
 )
 def test_wrong_frames_are_one_line(wrong):
-    with refused(ArgumentError, where="frames"):
+    with raises(ArgumentError, where="frames"):
         FrameRange.of(wrong)
 
 
@@ -265,7 +265,7 @@ def test_a_table_of_nothing_has_no_rows_and_missing_pandas_is_one_line(tmp_path,
     pytest.importorskip("pandas")
     assert data_frame((), "path").empty
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with refused(DependencyError, where="pandas"):
+    with raises(DependencyError, where="pandas"):
         data_frame((), "path")
 
 

@@ -24,7 +24,7 @@ from completion.predicting import Model, predict_dataset, predict_scans
 from completion.processes import Processes
 from completion.training import LAST, train
 from completion.weights import read_weights, write_weights
-from helpers.refusals import refused
+from helpers.errors import raises
 
 CPU = torch.device("cpu")
 ALONE = Processes(0, 1, CPU)
@@ -169,7 +169,7 @@ def test_raw_scans_are_completed_by_a_network_of_one_scan(data, tmp_path):
 
 
 def test_weights_for_another_history_or_grid_and_grids_that_do_not_divide_are_refused(weights):
-    with refused(
+    with raises(
         FormatError,
         where="seen.0.weight",
         expected="32 x 16 x 3 x 3",
@@ -177,7 +177,7 @@ def test_weights_for_another_history_or_grid_and_grids_that_do_not_divide_are_re
         advice="history",
     ):
         Model.read(weights, 1).complete_on(SPEC, CPU, "eager")
-    with refused(ArgumentError, expected="8 x 8 x 1", found="12 x 16 x 8"):
+    with raises(ArgumentError, expected="8 x 8 x 1", found="12 x 16 x 8"):
         build_network("baseline", 11, SPEC.with_size((12, 16, 8)))
 
 
@@ -195,7 +195,7 @@ def test_a_sample_that_is_alone_in_its_batch_is_too_little_for_the_batch_norms_o
 ):
     # 6 samples, 16 x 16 cells
     config = Config("motionsc", epochs=1, batch_size=5, workers=0, class_weights="none")
-    with refused(
+    with raises(
         CarlascError, where="epoch 1, batch 2", problem="1 sample", advice="batch_size"
     ) as error:
         train(data, config, tmp_path, ALONE)

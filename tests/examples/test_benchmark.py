@@ -39,7 +39,7 @@ from benchmarking.tables import (
     with_interval,
 )
 from completion.processes import Processes
-from helpers.refusals import refused
+from helpers.errors import raises
 
 ALONE = Processes(0, 1, torch.device("cpu"))
 TINY = SIZES["tiny"]
@@ -96,7 +96,7 @@ def test_drives_are_made_once_and_other_scenes_do_not_mix_with_them(folder):
     )
     assert done == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert {path: path.stat().st_mtime_ns for path in files} == files
-    with refused(ConflictError, where="scenes.json"):
+    with raises(ConflictError, where="scenes.json"):
         build_drives(folder / "data", dataclasses.replace(TINY.scenes, sensors=5), workers=1)
 
 

@@ -16,7 +16,7 @@ from completion.inference import check_compiler, prepare
 from completion.latency import measure_network
 from completion.networks import build_network
 from completion.throughput import measure_throughput
-from helpers.refusals import refused
+from helpers.errors import raises
 
 CPU = torch.device("cpu")
 
@@ -61,9 +61,9 @@ def test_a_compiled_network_gives_the_labels_of_the_eager_one():
 def test_a_missing_compiler_is_one_line_that_says_what_to_install(monkeypatch):
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CXX", raising=False)
-    with refused(DependencyError, where="torch.compile", expected="C++", advice="apt install g++"):
+    with raises(DependencyError, where="torch.compile", expected="C++", advice="apt install g++"):
         check_compiler(CPU)
-    with refused(ArgumentError, where="mode"):
+    with raises(ArgumentError, where="mode"):
         prepare(build_network("sscnet", 11, SPEC), CPU, "fast")
 
 

@@ -17,7 +17,7 @@ pytest.importorskip("torch", reason="needs carlasc[torch]")
 import torch
 from completion.losses import IGNORE
 from completion.tasks import WEIGHTINGS
-from helpers.refusals import refused
+from helpers.errors import raises
 from js3cnet.model import JS3CNet, nearest, pool
 from js3cnet.sparse import Level, NormReLU, SameSites, Sites
 from js3cnet.task import PointsAndVoxels, site_cells
@@ -308,7 +308,7 @@ def test_augmented_cells_are_within_the_grid_and_come_from_the_generator():
 
 
 def test_a_cylindrical_grid_is_refused():
-    with refused(ArgumentError, where="grid", found="cylindrical"):
+    with raises(ArgumentError, where="grid", found="cylindrical"):
         JS3CNet(11, GridSpec.published("cylindrical"))
 
 
@@ -351,9 +351,9 @@ def test_a_scan_without_points_or_with_wrong_ones_is_named():
         "sequence": ["a", "Town01_Light"],
         "frame": torch.tensor([1, 7]),
     }
-    with refused(ArgumentError, where="Town01_Light 7: points", found="none"):
+    with raises(ArgumentError, where="Town01_Light 7: points", found="none"):
         task.prepare(batch, cpu)
-    with refused(ArgumentError, where="points", expected="finite", found="1 points"):
+    with raises(ArgumentError, where="points", expected="finite", found="1 points"):
         task.prepare({"points": [torch.tensor([[0.0, 0, 0], [float("nan"), 0, 0]])]}, cpu)
 
 
@@ -362,7 +362,7 @@ def test_remission_is_the_fourth_column_where_a_network_takes_it_and_must_be_the
     points, remission = torch.rand(5, 3), torch.rand(5)
     (scan,) = task.prepare({"points": [points], "remission": [remission]}, cpu)["points"]
     assert torch.equal(scan, torch.cat([points, remission[:, None]], 1))
-    with refused(ArgumentError, expected="remission", found="zeros", advice="js3cnet"):
+    with raises(ArgumentError, expected="remission", found="zeros", advice="js3cnet"):
         task.prepare({"points": [points], "remission": [torch.zeros(5)]}, cpu)
     (plain,) = PointsAndVoxels().prepare({"points": [points]}, cpu)["points"]
     assert torch.equal(plain[:, :3], points) and not plain[:, 3].any()

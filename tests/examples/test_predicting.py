@@ -24,7 +24,7 @@ from completion.config import Config
 from completion.networks import build_network
 from completion.predicting import Model, predict_dataset, predict_scans
 from completion.weights import read_weights, write_weights
-from helpers.refusals import refused
+from helpers.errors import raises
 
 CPU = torch.device("cpu")
 
@@ -93,7 +93,7 @@ def test_grids_beside_the_data_leave_the_data_as_they_are(data, tmp_path):
     predict_dataset(model, str(root), None, CPU, "eager")
     assert all(path.read_bytes() == content for path, content in before.items())
     assert evaluate(root, root, grid="completion").frames == 2
-    with refused(ConflictError, expected="sscnet"):
+    with raises(ConflictError, expected="sscnet"):
         predict_dataset(
             Model.read(save(tmp_path / "other.pt", "sscnet")), str(root), None, CPU, "eager"
         )
@@ -133,9 +133,9 @@ def test_networks_of_points_complete_data_sets_and_raw_scans_alike(data, tmp_pat
         )
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "000000.bin").write_bytes(b"")
-    with refused(ArgumentError, where="points", found="none"):
+    with raises(ArgumentError, where="points", found="none"):
         predict_scans(model, tmp_path / "empty", tmp_path / "none", CPU, "eager", spec=SPEC)
-    with refused(ArgumentError, where="points", expected="remission"):
+    with raises(ArgumentError, where="points", expected="remission"):
         predict_scans(
             Model.read(save(tmp_path / "kitti.pt", "js3cnet_kitti")),
             scans,
@@ -157,7 +157,7 @@ def test_the_settings_of_a_run_tell_networks_with_the_same_weights_apart(tmp_pat
 def test_points_of_another_class_table_are_refused(tmp_path):
     model = Model.read(save(tmp_path / "kitti.pt", "js3cnet", classes=20))
     assert model.classes.name == "semantickitti19"
-    with refused(
+    with raises(
         FormatError,
         where="seg_head.linear.weight",
         expected="10 x 16",
@@ -182,13 +182,13 @@ def test_weights_that_do_not_fit_name_the_layer_and_both_shapes(tmp_path):
         ),
     }
     for path, history, parts in cases.values():
-        with refused(FormatError, **parts):
+        with raises(FormatError, **parts):
             Model.read(path, history).complete_on(SPEC, CPU, "eager")
-    with refused(FormatError, where="classes.pt", expected="11", found="7"):
+    with raises(FormatError, where="classes.pt", expected="11", found="7"):
         Model.read(save(tmp_path / "classes.pt", classes=7))
     from completion.weights import load_weights
 
-    with refused(
+    with raises(
         FormatError,
         where="conv_classes.weight",
         expected="11 x 128 x 1 x 1 x 1",
@@ -200,7 +200,7 @@ def test_weights_that_do_not_fit_name_the_layer_and_both_shapes(tmp_path):
             read_weights(save(tmp_path / "k.pt", "sscnet", classes=7)),
             "k.pt",
         )
-    with refused(FormatError, where="s.pt", expected="layer", found="none"):
+    with raises(FormatError, where="s.pt", expected="layer", found="none"):
         load_weights(
             build_network("sscnet_full", 11, SPEC),
             read_weights(save(tmp_path / "s.pt", "sscnet")),
@@ -233,9 +233,9 @@ def test_files_that_are_no_state_dict_are_refused_and_nothing_in_them_runs(tmp_p
 
 def test_scans_without_poses_take_no_history_and_an_empty_folder_is_named(tmp_path):
     model = Model.read(save(tmp_path / "net.pt", "motionsc", history=2), 2)
-    with refused(ArgumentError, where="history", expected="1", found="2"):
+    with raises(ArgumentError, where="history", expected="1", found="2"):
         predict_scans(model, tmp_path, tmp_path / "out", CPU, "eager", spec=SPEC)
-    with refused(MissingDataError, where=str(tmp_path), expected=".bin"):
+    with raises(MissingDataError, where=str(tmp_path), expected=".bin"):
         predict_scans(
             Model.read(save(tmp_path / "one.pt")),
             tmp_path,
@@ -247,9 +247,9 @@ def test_scans_without_poses_take_no_history_and_an_empty_folder_is_named(tmp_pa
 
 
 def test_grids_that_do_not_divide_are_refused():
-    with refused(ArgumentError, expected="16 x 16 x 1", found="24 x 16 x 8"):
+    with raises(ArgumentError, expected="16 x 16 x 1", found="24 x 16 x 8"):
         build_network("motionsc", 11, SPEC.with_size((24, 16, 8)))
-    with refused(ArgumentError, expected="4 x 4 x 4", found="16 x 16 x 15"):
+    with raises(ArgumentError, expected="4 x 4 x 4", found="16 x 16 x 15"):
         build_network("sscnet", 11, SPEC.with_size((16, 16, 15)))
 
 

@@ -27,7 +27,7 @@ from completion.data import EpochSampler, TrainLoader, open_split
 from completion.processes import Processes
 from completion.training import BEST, LAST, train
 from completion.weights import read_checkpoint, read_weights
-from helpers.refusals import refused
+from helpers.errors import raises
 
 ALONE = Processes(0, 1, torch.device("cpu"))
 QUICK = Config(
@@ -135,9 +135,9 @@ def test_shards_of_a_packed_store_are_read_one_after_another_and_files_in_any_or
 
 def test_a_run_is_neither_overwritten_nor_resumed_with_other_settings(data, tmp_path):
     train(data, replace(QUICK, epochs=1), tmp_path, ALONE)
-    with refused(ConflictError, where="last.pt", found="one", advice="--resume"):
+    with raises(ConflictError, where="last.pt", found="one", advice="--resume"):
         train(data, QUICK, tmp_path, ALONE)
-    with refused(ConflictError, where="config.yaml", found="batch_size"):
+    with raises(ConflictError, where="config.yaml", found="batch_size"):
         train(data, replace(QUICK, batch_size=3), tmp_path, ALONE, resume=True)
 
 
@@ -172,7 +172,7 @@ def test_points_with_remission_train_the_network_that_takes_it(tmp_path):
 
 @pytest.mark.needs("tensorboard")
 def test_a_loss_that_is_no_number_stops_the_run_and_names_the_batch(data, tmp_path):
-    with refused(CarlascError, where="epoch 1, batch", problem="_Light "):
+    with raises(CarlascError, where="epoch 1, batch", problem="_Light "):
         train(data, replace(QUICK, learning_rate=1e30, flips=""), tmp_path, ALONE)
 
 
@@ -182,7 +182,7 @@ def test_running_out_of_memory_says_which_batch_size_to_try(data, tmp_path, monk
         raise torch.OutOfMemoryError("CUDA out of memory")
 
     monkeypatch.setattr(training, "target_of", no_memory)
-    with refused(
+    with raises(
         CarlascError, where="batch size 2", advice="--set batch_size=1 or --set precision=bf16"
     ):
         train(data, QUICK, tmp_path, ALONE)
@@ -190,15 +190,15 @@ def test_running_out_of_memory_says_which_batch_size_to_try(data, tmp_path, monk
 
 def test_data_that_cannot_be_trained_on_is_named(data, tmp_path):
     write_split(tmp_path / "only_train", "Train", ["Town01_Light"], frames=2)
-    with refused(MissingDataError, where="split 'val'"):
+    with raises(MissingDataError, where="split 'val'"):
         train(tmp_path / "only_train", QUICK, tmp_path / "a", ALONE)
-    with refused(ArgumentError, where="history", expected="3 frames", found="4"):
+    with raises(ArgumentError, where="history", expected="3 frames", found="4"):
         train(data, replace(QUICK, network="motionsc", history=4), tmp_path / "b", ALONE)
-    with refused(ArgumentError, where="compile", expected="False for js3cnet"):
+    with raises(ArgumentError, where="compile", expected="False for js3cnet"):
         train(data, replace(QUICK, network="js3cnet", compile=True), tmp_path / "d", ALONE)
-    with refused(ArgumentError, where="history", advice="motionsc"):
+    with raises(ArgumentError, where="history", advice="motionsc"):
         replace(QUICK, history=2)
-    with refused(FormatError, where="none.json", expected="carlasc stats --json"):
+    with raises(FormatError, where="none.json", expected="carlasc stats --json"):
         train(
             data, replace(QUICK, class_weights=str(tmp_path / "none.json")), tmp_path / "c", ALONE
         )
@@ -234,7 +234,7 @@ def test_how_much_rare_classes_weigh_is_the_networks_own_unless_the_settings_say
     )
     assert root.max() / root[0] > log.max() / log[0]
     np.testing.assert_allclose(root_weights(np.array([800, 100, 0])), [1, 2, 0])
-    with refused(ArgumentError, where="weighting", found="'much'"):
+    with raises(ArgumentError, where="weighting", found="'much'"):
         replace(QUICK, weighting="much")
 
 
@@ -298,7 +298,7 @@ def test_semantickitti_trains_on_its_19_classes_and_leaves_ignored_ones_out(tmp_
     points = open_split(tmp_path, "train", replace(config, network="js3cnet"), training=True)[0]
     assert set(np.unique(points["point_labels"])) == {0, 1, 9}
     write_split(tmp_path / "carla", "Train", ["Town01_Light"], frames=2)
-    with refused(ArgumentError, where="remap", expected="carla", found="semantickitti19"):
+    with raises(ArgumentError, where="remap", expected="carla", found="semantickitti19"):
         open_split(tmp_path / "carla", "train", config)
 
 
@@ -307,9 +307,9 @@ def test_settings_files_of_every_network_are_read(examples):
     assert len(files) == 9
     for file in files:
         assert Config.read(file, ["epochs=3"]).epochs == 3
-    with refused(ArgumentError, where=str(files[0]), found="speed"):
+    with raises(ArgumentError, where=str(files[0]), found="speed"):
         Config.read(files[0], ["speed=3"])
-    with refused(ArgumentError, where="epochs", expected="int", found="'many'"):
+    with raises(ArgumentError, where="epochs", expected="int", found="'many'"):
         Config.read(files[0], ["epochs=many"])
 
 
@@ -395,11 +395,9 @@ def test_a_run_on_soft_labels_learns(tmp_path):
 
 
 def test_data_that_have_no_soft_labels_are_refused_with_what_to_do(data, tmp_path):
-    with refused(MissingDataError, where="split 'train'"):
+    with raises(MissingDataError, where="split 'train'"):
         train(data, replace(QUICK, soft_labels=True), tmp_path, ALONE)
-    with refused(
-        ArgumentError, where="soft_labels", expected="remap=semantickitti19", found="True"
-    ):
+    with raises(ArgumentError, where="soft_labels", expected="remap=semantickitti19", found="True"):
         replace(QUICK, soft_labels=True, remap="semantickitti19")
 
 

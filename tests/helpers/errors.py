@@ -5,14 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TypeVar
 
 import pytest
 
 from carlasc.errors import CarlascError
 
+_Kind = TypeVar("_Kind", bound=CarlascError)
+
 
 @contextmanager
-def raises(kind: type[CarlascError], **parts: str) -> Iterator[pytest.ExceptionInfo[CarlascError]]:
+def raises(kind: type[_Kind], **parts: str) -> Iterator[pytest.ExceptionInfo[_Kind]]:
     """Assert that a block raises an error of a kind, some parts of which match.
 
     Args:
@@ -23,5 +26,5 @@ def raises(kind: type[CarlascError], **parts: str) -> Iterator[pytest.ExceptionI
     with pytest.raises(kind) as error:
         yield error
     for name, pattern in parts.items():
-        part = getattr(error.value, name)
+        part = str(getattr(error.value, name))
         assert re.search(pattern, part), f"{name}: {pattern!r} is not in {part!r}"

@@ -6,7 +6,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from helpers.parts import raises
+from helpers.errors import raises
 
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import layout

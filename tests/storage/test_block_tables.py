@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.datasets.sequences import files_of, lines, params, scan
-from helpers.parts import raises
+from helpers.errors import raises
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 

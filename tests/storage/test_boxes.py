@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.datasets.sequences import scan
-from helpers.parts import raises
+from helpers.errors import raises
 
 import carlasc
 from carlasc import Run

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.parts import raises
+from helpers.errors import raises
 
 from carlasc.errors import FormatError
 from carlasc.storage.packed.columns import narrow, quantise

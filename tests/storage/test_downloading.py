@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.parts import raises
+from helpers.errors import raises
 from helpers.servers.http_server import Site, serve
 
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError, MissingDataError

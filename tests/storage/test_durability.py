@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.parts import raises
+from helpers.errors import raises
 
 from carlasc.cli import app
 from carlasc.core.grids import GridSpec

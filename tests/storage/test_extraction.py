@@ -8,7 +8,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from helpers.parts import raises
+from helpers.errors import raises
 from storage.test_downloading import make_zip, names
 
 from carlasc.errors import CarlascError, ConflictError, FormatError

@@ -2,7 +2,7 @@ import io
 
 import numpy as np
 import pytest
-from helpers.parts import raises
+from helpers.errors import raises
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays

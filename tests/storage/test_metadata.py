@@ -1,7 +1,7 @@
 import json
 
 import pytest
-from helpers.parts import raises
+from helpers.errors import raises
 
 from carlasc.core.classes import ClassTable
 from carlasc.core.tables import CARLA, SEMANTICKITTI

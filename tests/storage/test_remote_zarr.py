@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.datasets.sequences import files_of
-from helpers.parts import raises
+from helpers.errors import raises
 from helpers.servers.object_store import (
     BUCKET,
     FaultyServer,

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from helpers.datasets.parquet_tables import seal_tables
 from helpers.datasets.sequences import files_of, write_dataset
-from helpers.parts import raises
+from helpers.errors import raises
 
 import carlasc
 from carlasc.errors import FormatError

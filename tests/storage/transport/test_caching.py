@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from filelock import FileLock
 from helpers.datasets.sequences import files_of, write_dataset
-from helpers.parts import raises
+from helpers.errors import raises
 from helpers.processes.cache_jobs import PIECE, read_files, tree_at
 from helpers.servers.range_server import Served, serve_folder
 

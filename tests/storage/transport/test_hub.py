@@ -11,7 +11,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from helpers.datasets.sequences import FRAMES, files_of, write_dataset
-from helpers.parts import raises
+from helpers.errors import raises
 from helpers.servers.hub_server import Hub, hub_server
 from storage.transport.test_zipped import write_zip
 from typer.testing import CliRunner

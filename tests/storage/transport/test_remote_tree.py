@@ -14,7 +14,7 @@ import fsspec
 import numpy as np
 import pytest
 from helpers.datasets.sequences import files_of, write_dataset
-from helpers.parts import raises
+from helpers.errors import raises
 from helpers.servers.object_store import BUCKET, faulty_server, options_for, s3_server
 from storage.transport.test_zipped import write_zip
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.datasets.sequences import files_of, write_dataset
-from helpers.parts import raises
+from helpers.errors import raises
 from helpers.servers.object_store import (
     BUCKET,
     KEY,

@@ -6,7 +6,7 @@ import pickle
 
 import numpy as np
 import pytest
-from helpers.parts import raises
+from helpers.errors import raises
 
 from carlasc.errors import CarlascError, FormatError, MissingDataError
 from carlasc.storage.files import leads_outside

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.datasets.sequences import files_of, write_dataset
-from helpers.parts import raises
+from helpers.errors import raises
 
 import carlasc
 from carlasc.errors import FormatError, MissingDataError
