@@ -11,10 +11,9 @@ import itertools
 from pathlib import Path
 
 import pytest
-from carlasc_recorders.town.simulation import simulate
 from helpers.datasets.captures import write_capture
 
-from carlasc import Run
+from carlasc import Run, simulate
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth import regrid
 from carlasc.storage.files import DURABLE

@@ -14,11 +14,11 @@ from carlasc import Run
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth import regrid
 
+pytestmark = pytest.mark.posix("programs without a suffix")
 PAGE = Path(__file__).parents[2] / "docs" / "howto" / "many-machines.md"
 SPEC = GridSpec.published().with_size((32, 32, 4))
 
 
-@pytest.mark.posix("programs without a suffix")
 @pytest.fixture
 def site(tmp_path):
     """A folder with the scripts of the page, a command `carlasc`, a capture, and what one run makes

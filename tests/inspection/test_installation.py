@@ -156,6 +156,7 @@ def test_json_holds_the_same_figures():
         "fsspec",
         "lazy-loader",
         "numba",
+        "filelock",
         "numpy",
         "rich",
         "typer",

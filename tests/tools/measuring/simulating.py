@@ -8,9 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from carlasc_recorders.town.drive import TownDrive
-from carlasc_recorders.town.simulation import simulate
 
-from carlasc import Run
+from carlasc import Run, simulate
 from measuring.figures import Figure
 from measuring.sizes import Size, by_turns
 

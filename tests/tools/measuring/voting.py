@@ -14,10 +14,9 @@ from pathlib import Path
 
 import numpy as np
 from benchmarks import test_bench_voting as bench
-from carlasc_recorders.town.simulation import simulate
 from helpers.references.plain_voting import plain_grid, plain_votes
 
-from carlasc import Run
+from carlasc import Run, simulate
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth import regrid
 from carlasc.storage.files import DURABLE
