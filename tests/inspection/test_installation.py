@@ -152,7 +152,7 @@ def test_json_holds_the_same_figures():
     assert ran.exit_code == 0
     assert found["version"] == carlasc.__version__
     assert {package["name"] for package in found["packages"]} == {
-        "aiohttp",
+        "urllib3",
         "fsspec",
         "lazy-loader",
         "numba",

@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from carlasc.errors import (
     CarlascError,
@@ -39,17 +39,17 @@ from carlasc.storage.files import (
     writing,
 )
 from carlasc.storage.transport.failures import (
+    StatusError,
     WrongAnswerError,
     describe_failure,
     fail,
     is_temporary,
 )
 from carlasc.storage.transport.requests import persist
-from carlasc.storage.transport.web import HttpAnswer, WebClient
+from carlasc.storage.transport.web import PARTIAL, WebClient
 
 _ZIP = b"PK"
 _GONE = (401, 403, 404, 410)
-_PARTIAL = 206
 _BLOCK = 16 << 20  # bytes per request
 _RESTARTS = 3  # after the file has changed
 
@@ -227,7 +227,8 @@ class FileFetch:
         is a zip.
         """
         with self._answer({"Range": f"bytes=0-{len(_ZIP) - 1}"}) as answer:
-            ranges, start = answer.status == _PARTIAL, answer.first[: len(_ZIP)]
+            ranges = answer.status == PARTIAL
+            start = answer.read(len(_ZIP))
             if start != _ZIP:
                 content = answer.headers.get("Content-Type", "data of unknown type")
                 raise FormatError(
@@ -253,7 +254,7 @@ class FileFetch:
             if file.validator is not None and _validator(answer) not in (file.validator, None):
                 raise _ChangedError
             if file.ranges:
-                if answer.status != _PARTIAL or _total(answer) != file.size:
+                if answer.status != PARTIAL or _total(answer) != file.size:
                     raise _ChangedError
                 count, expected = end - start, f"bytes {start}-{end - 1}/{file.size}"
                 if (header := answer.headers.get("Content-Range", "")) != expected:
@@ -265,7 +266,7 @@ class FileFetch:
                     f"expected {count} bytes, found a Content-Length of {_length(answer)}"
                 )
             left = count
-            for data in answer.pieces():  # what follows the expected bytes is not read
+            for data in self._client.pieces(answer):  # what follows the expected bytes is not read
                 yield data if left is None else data[:left]
                 if left is not None and (left := max(0, left - len(data))) == 0:
                     return
@@ -273,16 +274,16 @@ class FileFetch:
                 raise WrongAnswerError(f"the connection ended {left} bytes early")
 
     @contextmanager
-    def _answer(self, headers: dict[str, str]) -> Iterator[HttpAnswer]:
-        with self._client.answer(headers) as answer:
+    def _answer(self, headers: dict[str, str]) -> Iterator[Any]:
+        with self._client.answer(self._client.url, headers) as answer:
             if answer.status in _GONE:
                 raise MissingDataError(
                     self._where,
                     expected="a file",
                     found=f"status {answer.status} ({answer.reason})",
                 )
-            if answer.error is not None:
-                raise answer.error
+            if answer.status >= 300:
+                raise StatusError(answer.status)
             yield answer
 
     def _persist(
@@ -363,16 +364,16 @@ class FileFetch:
         self.discard_record()
 
 
-def _validator(answer: HttpAnswer) -> str | None:
+def _validator(answer: Any) -> str | None:
     return answer.headers.get("ETag") or answer.headers.get("Last-Modified")
 
 
-def _length(answer: HttpAnswer) -> int | None:
+def _length(answer: Any) -> int | None:
     text = answer.headers.get("Content-Length", "")
     return int(text) if re.fullmatch("[0-9]{1,18}", text) else None
 
 
-def _total(answer: HttpAnswer) -> int:
+def _total(answer: Any) -> int:
     """Return the size of the whole file, from Content-Range."""
     text = answer.headers.get("Content-Range", "")
     match = re.fullmatch(r"bytes [0-9]+-[0-9]+/([0-9]{1,18})", text)
