@@ -14,7 +14,7 @@ from carlasc.storage.transport.clients import HUB, Client, FileSystemClient
 from carlasc.storage.transport.failures import WrongAnswerError, fail
 from carlasc.storage.transport.object_stores import SCHEMES, ObjectStoreClient
 from carlasc.storage.transport.requests import send
-from carlasc.storage.transport.trees import LocalTree, Tree, check_length, is_url
+from carlasc.storage.transport.trees import LocalTree, Tree, check_length, from_start, is_url
 from carlasc.storage.transport.web import HubClient, WebClient
 
 _BLOCK = 1 << 18  # bytes per block of a remote file
@@ -144,9 +144,7 @@ class RemoteTree(Tree):
     def read_ranges(self, ranges: Sequence[tuple[str, int, int]]) -> list[bytes | memoryview]:
         """Fetch the ranges, several at a time."""
         sizes = {path: self.version(path)[0] for path, start, _ in ranges if start < 0}
-        wanted = [
-            (p, max(0, sizes[p] + s), sizes[p] + e) if s < 0 else (p, s, e) for p, s, e in ranges
-        ]
+        wanted = [(p, *from_start(start, end, sizes.get(p, 0))) for p, start, end in ranges]
         asked = [part for part in wanted if part[1] < part[2]]
         answers = iter(self.ask(self._range, *asked))
         parts = [(part, next(answers) if part[1] < part[2] else b"") for part in wanted]

@@ -15,8 +15,6 @@ from pathlib import Path
 
 from carlasc.errors import CarlascError, FormatError, MissingDataError
 
-# Minimum size of mapped ranges. Reading the megabyte of a scan is faster than mapping its pages.
-_MAPPED = 1 << 22
 # Opening a pipe would hang without a writer; Windows would change the ends of lines.
 _READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
@@ -130,15 +128,12 @@ class LocalTree(Tree):
             return memoryview(mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ))
 
     def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
-        """Read the range, or map it into memory if it is large."""
+        """Read the range."""
         with self._opened(path) as descriptor:
             size = os.fstat(descriptor).st_size
-            if start < 0:
-                start, end = max(0, size + start), size + end
+            start, end = from_start(start, end, size)
             if end > size:  # the range may come from a damaged table, and be larger than the memory
                 raise _shorter(end - start, max(0, size - start), self.where(path))
-            if end - start >= _MAPPED:
-                return _map_range(descriptor, start, end)
             os.lseek(descriptor, start, os.SEEK_SET)
             data = os.read(descriptor, end - start)
         return check_length(data, end - start, self.where(path))
@@ -160,17 +155,9 @@ class LocalTree(Tree):
             raise FormatError(path, problem=f"cannot be read: {error.strerror or error}") from error
 
 
-def _map_range(descriptor: int, start: int, end: int) -> memoryview:
-    """Map the bytes [start, end) of an open file into memory. The file must be long enough."""
-    skipped = start % mmap.ALLOCATIONGRANULARITY
-    length, offset = end - start + skipped, start - skipped
-    if os.name == "nt":
-        mapped = mmap.mmap(descriptor, length, access=mmap.ACCESS_READ, offset=offset)
-    else:
-        # read all pages at once (Linux only)
-        flags = mmap.MAP_SHARED | getattr(mmap, "MAP_POPULATE", 0)
-        mapped = mmap.mmap(descriptor, length, flags, mmap.PROT_READ, offset=offset)
-    return memoryview(mapped)[skipped:]
+def from_start(start: int, end: int, size: int) -> tuple[int, int]:
+    """Return a range counted from the start of a file of `size` bytes (see `Tree.read_range`)."""
+    return (max(0, size + start), size + end) if start < 0 else (start, end)
 
 
 def check_length(data: bytes, expected: int, where: str) -> bytes:

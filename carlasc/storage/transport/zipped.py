@@ -7,6 +7,7 @@ seconds and a gigabyte. This module parses the central directory once (PKWARE's 
 
 from __future__ import annotations
 
+import stat
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
@@ -19,7 +20,7 @@ from carlasc.core.arrays import IntArray
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage.arrays import check_ratio
 from carlasc.storage.files import leads_outside
-from carlasc.storage.transport.trees import Tree, check_length
+from carlasc.storage.transport.trees import Tree, check_length, from_start
 
 _END = struct.Struct("<4s4H2LH")  # end of central directory record
 _END64_LOCATOR = struct.Struct("<4sLQL")
@@ -28,9 +29,9 @@ _LOCAL = struct.Struct("<4s5H3L2H")
 # the fixed fields of a record of the central directory that are used
 _RECORD = np.dtype(
     {
-        "names": ("flags", "method", "crc", "packed", "size", "name", "extra", "offset"),
-        "formats": ("<u2", "<u2", "<u4", "<u4", "<u4", "<u2", "<u2", "<u4"),
-        "offsets": (8, 10, 16, 20, 24, 28, 30, 42),
+        "names": ("flags", "method", "crc", "packed", "size", "name", "extra", "mode", "offset"),
+        "formats": ("<u2", "<u2", "<u4", "<u4", "<u4", "<u2", "<u2", "<u2", "<u4"),
+        "offsets": (8, 10, 16, 20, 24, 28, 30, 40, 42),
         "itemsize": 46,
     }
 )
@@ -76,6 +77,16 @@ class ZipTree(Tree):
         """Whether a member of that name exists."""
         return self._number(path) >= 0
 
+    def sizes(self) -> dict[str, int]:
+        """Return the unpacked sizes of all files, by path."""
+        columns, folders = self._index
+        return {
+            f"{folder}/{name}" if folder else name: int(columns["size"][number])
+            for folder, names in folders.items()
+            for name, number in names.items()
+            if number >= 0
+        }
+
     def read(self, path: str, size: int | None = None) -> bytes | memoryview:
         """Read a member and check its checksum."""
         return self.read_many([path], size)[0]
@@ -100,7 +111,7 @@ class ZipTree(Tree):
     def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
         """Return a part of a member. The whole member is read, because it may be compressed."""
         data = self.read(path)
-        start, end = (max(0, len(data) + start), len(data) + end) if start < 0 else (start, end)
+        start, end = from_start(start, end, len(data))
         return check_length(data[start:end], end - start, self.where(path))
 
     def _extract(self, path: str, member: dict[str, int], data: memoryview) -> bytes | memoryview:
@@ -148,8 +159,8 @@ def read_index(tree: Tree, path: str) -> tuple[_Columns, _Folders]:
         the member, -1 for a folder.
 
     Raises:
-        FormatError: the zip is truncated, its directory is damaged, or a member's name leads out of
-            the folder.
+        FormatError: the zip is truncated, its directory is damaged, or a member is a link or its
+            name leads out of the folder.
     """
     where = tree.where(path)
     count, start, size = _find_directory(tree, path)
@@ -165,6 +176,13 @@ def read_index(tree: Tree, path: str) -> tuple[_Columns, _Folders]:
     columns["end"] = np.minimum(ends + columns["name"] + columns["extra"] + _SLACK, start)
     names = _names(data, positions + _RECORD.itemsize, columns)
     _check_names(names, where)
+    for number in np.flatnonzero(columns["mode"] >> 12 == stat.S_IFLNK >> 12).tolist()[:1]:
+        raise FormatError(
+            where,
+            expected="files",
+            found=f"the link {names[number]!r}",
+            advice="do not unpack this zip",
+        )
     folders: _Folders = {"": {}}
     for number, name in enumerate(names):
         folder, _, base = name.rpartition("/")
@@ -293,7 +311,7 @@ def _check_names(names: list[str], where: str) -> None:
         if leads_outside(name):
             raise FormatError(
                 where,
-                expected="names inside the zip",
+                expected="names inside the folder",
                 found=repr(name),
                 advice="the name leads out of the folder: do not unpack this zip",
             )
