@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from filelock import FileLock, Timeout
 
@@ -31,6 +31,8 @@ _LARGEST_SHARE = 4  # files above 1/4 of the cache size are read without the cac
 _PART = ".part"
 _LOCKS = ".locks"  # the folder of locks
 _FULL_S = 60.0  # pause of fetching after the disk was full
+
+_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True)
@@ -211,13 +213,11 @@ class CachedTree(Tree):
 
     def read(self, path: str, size: int | None = None) -> bytes | memoryview:
         """Map the cached file into memory."""
-        cached = self._read(path, lambda tree, name: tree.read(name))
-        return self.remote.read(path) if cached is None else cached
+        return self._use(path, lambda tree, name: tree.read(name))
 
     def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
         """Read the range of the cached file."""
-        cached = self._read(path, lambda tree, name: tree.read_range(name, start, end))
-        return self.remote.read_range(path, start, end) if cached is None else cached
+        return self._use(path, lambda tree, name: tree.read_range(name, start, end))
 
     def fetch(self, path: str, *, wait: bool = True) -> bool:
         """Fetch a file into the cache, or record that it will be used.
@@ -232,27 +232,24 @@ class CachedTree(Tree):
         Raises:
             CarlascError: the file does not exist, or the server does not answer.
         """
-        return self._read(path, lambda tree, name: b"", wait) is not None
+        return self._use(path, lambda tree, _: tree is not self.remote, wait)
 
-    def _read(
-        self,
-        path: str,
-        read: Callable[[LocalTree, str], bytes | memoryview],
-        wait: bool = True,
-    ) -> bytes | memoryview | None:
-        """Read a cached file, and record its use; return None if it is not in the cache."""
+    def _use(self, path: str, use: Callable[[Tree, str], _Result], wait: bool = True) -> _Result:
+        """Call `use` with a tree and the name of a file in it: the cached file, whose use is
+        recorded, or the remote file if it must be read without the cache.
+        """
         for _ in range(2):
             try:
                 if (name := self._find(path, wait)) is None:
-                    return None
-                data = read(_CacheFolder(self.cache.path(name).parent, self.where(path)), name)
+                    break
+                result = use(_CacheFolder(self.cache.path(name).parent, self.where(path)), name)
                 self.cache.touch(name)
-                return data
+                return result
             except (MissingDataError, FileNotFoundError):
                 if self._names.pop(path, None) is None:
                     raise  # the remote file does not exist
                 # removed to make room: fetched again
-        return None
+        return use(self.remote, path)
 
     def _find(self, path: str, wait: bool) -> str | None:
         """Return the name of a file in the cache, fetching it if necessary; None if it must be read

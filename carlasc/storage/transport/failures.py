@@ -58,7 +58,7 @@ def is_temporary(error: BaseException) -> bool:
         return False
     if _is_of_connection(error):
         return True
-    status, _ = _status_and_code(error)
+    status, _ = status_and_code(error)
     if status is not None:
         return status in _BUSY or (status >= 500 and status != 501)  # 501: not implemented
     if _is_of_obstore(error):
@@ -71,16 +71,6 @@ def is_offline(error: BaseException) -> bool:
     set.
     """
     return type(error).__name__ == "OfflineModeIsEnabled"
-
-
-def ends_before(error: BaseException) -> bool:
-    """Whether a request failed because its range starts after the end of the file."""
-    return _status_and_code(error)[0] == 416
-
-
-def bucket_is_missing(error: BaseException) -> bool:
-    """Whether the bucket of an S3 URL does not exist."""
-    return _status_and_code(error)[1] == "NoSuchBucket"
 
 
 def fail(where: str, error: BaseException, *, writing: bool = False) -> NoReturn:
@@ -101,7 +91,7 @@ def fail(where: str, error: BaseException, *, writing: bool = False) -> NoReturn
     """
     if isinstance(error, CarlascError):
         raise error
-    status, code = _status_and_code(error)
+    status, code = status_and_code(error)
     kind, missing = (StorageError,) * 2 if writing else (CarlascError, MissingDataError)
     if code == "NoSuchBucket":
         raise missing(
@@ -155,7 +145,7 @@ def describe_failure(error: BaseException) -> str:
     """Describe an error of a request without credentials: its status, its code or the name of its
     class.
     """
-    status, code = _status_and_code(error)
+    status, code = status_and_code(error)
     if isinstance(error, WrongAnswerError):
         return str(error)
     if _is_of_obstore(error) and status is None:
@@ -192,7 +182,7 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__
 
 
-def _status_and_code(error: BaseException) -> tuple[int | None, str]:
+def status_and_code(error: BaseException) -> tuple[int | None, str]:
     """Return the HTTP status of an error, and the code of an S3 error ("NoSuchBucket"), if it has
     them.
     """

@@ -132,10 +132,9 @@ class LocalTree(Tree):
         with self._opened(path) as descriptor:
             size = os.fstat(descriptor).st_size
             start, end = from_start(start, end, size)
-            if end > size:  # the range may come from a damaged table, and be larger than the memory
-                raise _shorter(end - start, max(0, size - start), self.where(path))
-            os.lseek(descriptor, start, os.SEEK_SET)
-            data = os.read(descriptor, end - start)
+            os.lseek(descriptor, min(start, size), os.SEEK_SET)
+            # the range may come from a damaged table, and be larger than the memory
+            data = os.read(descriptor, max(0, min(end, size) - start))
         return check_length(data, end - start, self.where(path))
 
     @contextmanager
@@ -172,17 +171,13 @@ def check_length(data: bytes, expected: int, where: str) -> bytes:
         FormatError: the length is different: the file is truncated, or a server sent another range.
     """
     if len(data) != expected:
-        raise _shorter(expected, len(data), where)
+        raise FormatError(
+            where,
+            expected=f"{expected} bytes in this range",
+            found=str(len(data)),
+            advice="the file may be truncated",
+        )
     return data
-
-
-def _shorter(expected: int, found: int, where: str) -> FormatError:
-    return FormatError(
-        where,
-        expected=f"{expected} bytes in this range",
-        found=str(found),
-        advice="the file may be truncated",
-    )
 
 
 def is_url(place: object) -> bool:

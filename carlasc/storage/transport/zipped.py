@@ -283,19 +283,13 @@ def _add_folder(folders: _Folders, folder: str) -> None:
 
 
 def _names(data: bytes, begins: IntArray, columns: _Columns) -> list[str]:
-    """Return the names of the members.
-
-    The whole directory is decoded at once; if it is not ASCII, each name separately.
-    """
-    text = data.decode("latin-1")
-    names = [
-        text[a:b] for a, b in zip(begins.tolist(), (begins + columns["name"]).tolist(), strict=True)
-    ]
-    if not "".join(names).isascii():
-        for member, name in enumerate(names):
-            if not name.isascii():
-                encoding = "utf-8" if columns["flags"][member] & _UTF8 else "cp437"
-                names[member] = name.encode("latin-1").decode(encoding, "replace")
+    """Return the names of the members, in UTF-8 or in code page 437."""
+    ends, are_utf8 = begins + columns["name"], columns["flags"] & _UTF8
+    names = []
+    for begin, end, is_utf8 in zip(begins.tolist(), ends.tolist(), are_utf8.tolist(), strict=True):
+        name = data[begin:end]
+        encoding = "utf-8" if is_utf8 or name.isascii() else "cp437"
+        names.append(name.decode(encoding, "replace"))
     return names
 
 
