@@ -264,18 +264,18 @@ class CachedTree(Tree):
                     self._names[path] = None
                     return None
                 name = f"{key}-{_digest(version)[:16]}-{size}"
-                if not self._add(path, name, wait):
+                if not self._add(path, name, size, wait):
                     return None
                 self._names[path] = name
                 self.cache.touch(name, compared=True)
             self._names[path] = name
         return self._names[path]
 
-    def _add(self, path: str, name: str, wait: bool) -> bool:
+    def _add(self, path: str, name: str, size: int, wait: bool) -> bool:
         if time.monotonic() < self._full_until:
             return _is_whole(self.cache.path(name))
         try:
-            return self.cache.add(name, partial(self._fill, path, _size_of(name)), wait=wait)
+            return self.cache.add(name, partial(self._fill, path, size), wait=wait)
         except OSError:  # the disk is full: the file is read from the server
             self._full_until = time.monotonic() + _FULL_S
             return False

@@ -129,14 +129,6 @@ class RemoteTree(Tree):
         files = self.ask(self.client.files, (folder,))[0]
         return {"/".join(filter(None, (folder, name))): size for name, size in files.items()}
 
-    def read(self, path: str, size: int | None = None) -> bytes | memoryview:
-        """Fetch the file."""
-        return self.read_many([path])[0]
-
-    def read_range(self, path: str, start: int, end: int) -> bytes:
-        """Fetch the range."""
-        return bytes(self.read_ranges([(path, start, end)])[0])
-
     def read_many(self, paths: Sequence[str], size: int | None = None) -> list[bytes | memoryview]:
         """Fetch the files, several at a time."""
         return [*self.ask(self.client.get, *((path,) for path in paths))]
@@ -221,7 +213,7 @@ class RemoteFile(io.RawIOBase):
     a block is read with one request.
     """
 
-    def __init__(self, fetch: Callable[[int, int], bytes], size: int) -> None:
+    def __init__(self, fetch: Callable[[int, int], bytes | memoryview], size: int) -> None:
         """Create a file of `size` bytes.
 
         `fetch` returns the bytes [start, end). Nothing is fetched yet.
@@ -229,7 +221,7 @@ class RemoteFile(io.RawIOBase):
         self._fetch, self._size, self._place = fetch, size, 0
         self._block = lru_cache(_KEPT)(self._fetch_block)
 
-    def _fetch_block(self, number: int) -> bytes:
+    def _fetch_block(self, number: int) -> bytes | memoryview:
         return self._fetch(number * _BLOCK, min((number + 1) * _BLOCK, self._size))
 
     def readable(self) -> bool:
@@ -245,10 +237,6 @@ class RemoteFile(io.RawIOBase):
         self._place = max(
             0, offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._place, io.SEEK_END: self._size}[whence]
         )
-        return self._place
-
-    def tell(self) -> int:
-        """Return the position in the file."""
         return self._place
 
     def readinto(self, buffer: bytearray | memoryview) -> int:  # type: ignore[override]

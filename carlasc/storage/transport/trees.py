@@ -12,15 +12,21 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
 from carlasc.errors import CarlascError, FormatError, MissingDataError
 
 # Opening a pipe would hang without a writer; Windows would change the ends of lines.
 _READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
+_Data = TypeVar("_Data", bound=bytes | memoryview)
+
 
 class Tree(ABC):
     """A folder of files. Paths in it are relative, with "/" between parts; "" is the folder itself.
+
+    A kind of tree has `read` or `read_many`, and `read_range` or `read_ranges`; each of them calls
+    the other.
 
     Attributes:
         location: its name in errors: a folder, a zip, a URL.
@@ -34,7 +40,6 @@ class Tree(ABC):
         does not exist.
         """
 
-    @abstractmethod
     def read(self, path: str, size: int | None = None) -> bytes | memoryview:
         """Return a file's bytes.
 
@@ -47,8 +52,8 @@ class Tree(ABC):
             MissingDataError: the file does not exist.
             FormatError: the file cannot be read, or is damaged.
         """
+        return self.read_many([path], size)[0]
 
-    @abstractmethod
     def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
         """Return the bytes [start, end) of a file.
 
@@ -58,6 +63,7 @@ class Tree(ABC):
             MissingDataError: the file does not exist.
             FormatError: the file is shorter.
         """
+        return self.read_ranges([(path, start, end)])[0]
 
     def is_file(self, path: str) -> bool:
         """Whether a file exists."""
@@ -159,7 +165,7 @@ def from_start(start: int, end: int, size: int) -> tuple[int, int]:
     return (max(0, size + start), size + end) if start < 0 else (start, end)
 
 
-def check_length(data: bytes, expected: int, where: str) -> bytes:
+def check_length(data: _Data, expected: int, where: str) -> _Data:
     """Return `data` if it has the expected length.
 
     Args:

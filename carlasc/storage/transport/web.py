@@ -127,7 +127,7 @@ class WebClient(Client):
                 raise FileNotFoundError(url)
             if answer.status >= 300:
                 raise StatusError(answer.status)
-            if start is not None:
+            if start is not None and end is not None:
                 if answer.status != PARTIAL:
                     raise WholeFileError("the whole file instead of a range")
                 check_range(answer.headers.get("Content-Range"), start, end)
@@ -199,7 +199,7 @@ class HubClient(FileSystemClient):
         return self._web.get(self.connection.url(url), start, end, headers)
 
 
-def check_range(header: str | None, start: int, end: int | None) -> None:
+def check_range(header: str | None, start: int, end: int) -> None:
     """Compare the header Content-Range, "bytes 0-99/1000", with the requested range.
 
     The file may end before the range does.
@@ -207,13 +207,11 @@ def check_range(header: str | None, start: int, end: int | None) -> None:
     Args:
         header: the header; None if the server sent none.
         start: first requested byte.
-        end: end of the requested range, exclusive; None for the end of the file.
+        end: end of the requested range, exclusive.
 
     Raises:
         WrongAnswerError: the header has another range.
     """
-    first, _, last = (header or "").removeprefix("bytes ").partition("/")[0].partition("-")
-    if header is not None and not (
-        first == str(start) and last.isdigit() and (end is None or int(last) < end)
-    ):
+    found = re.fullmatch(r"bytes (\d+)-(\d+)/.*", header or f"bytes {start}-{start}/*")
+    if found is None or int(found[1]) != start or int(found[2]) >= end:
         raise WrongAnswerError("another range of the file")

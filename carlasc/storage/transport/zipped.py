@@ -87,12 +87,8 @@ class ZipTree(Tree):
             if number >= 0
         }
 
-    def read(self, path: str, size: int | None = None) -> bytes | memoryview:
-        """Read a member and check its checksum."""
-        return self.read_many([path], size)[0]
-
     def read_many(self, paths: Sequence[str], size: int | None = None) -> list[bytes | memoryview]:
-        """Read several members; all at once from a remote zip.
+        """Read several members and check their checksums; all at once from a remote zip.
 
         The size and the compression ratio are checked before decompressing.
         """
