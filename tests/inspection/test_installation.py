@@ -152,13 +152,14 @@ def test_json_holds_the_same_figures():
     assert ran.exit_code == 0
     assert found["version"] == carlasc.__version__
     assert {package["name"] for package in found["packages"]} == {
-        "urllib3",
+        "filelock",
         "fsspec",
         "lazy-loader",
         "numba",
         "numpy",
         "rich",
         "typer",
+        "urllib3",
     }
     assert found["processor"]["usable"] >= 1 and found["compiled"]["compile_s"] > 0
     assert found["compiled"]["writable"] is True
