@@ -68,7 +68,7 @@ def test_the_quick_start_makes_one_training_step_in_ten_lines(path, downloads):
     assert names["optimizer"].state[next(network.parameters())]["step"] == 1
 
 
-@pytest.mark.needs("zarr", "aiohttp")
+@pytest.mark.needs("zarr", "urllib3")
 def test_the_how_to_runs_from_top_to_bottom(downloads, capsys, tmp_path):
     names: dict = {}
     (tmp_path / "bucket").mkdir()

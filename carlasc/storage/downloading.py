@@ -91,10 +91,10 @@ def choose_archives(splits: Iterable[str], what: str) -> tuple[Archive, ...]:
     check_choice("what", what, kinds)
     known = tuple(dict.fromkeys(archive.split for archive in ARCHIVES if archive.split))
     wanted = {split.lower() for split in splits}
-    if unknown := wanted - {*known, "all"}:
-        raise ArgumentError(
-            "split", expected=f"one of {', '.join(known)}, all", found=", ".join(sorted(unknown))
-        )
+    unknown = wanted - {*known, "all"}
+    if unknown or (what == SEQUENCES and not wanted):
+        found = ", ".join(sorted(unknown)) or "none"
+        raise ArgumentError("split", expected=f"one of {', '.join(known)}, all", found=found)
     if what != SEQUENCES and wanted - {"all"}:
         raise ArgumentError(
             "split",
@@ -102,14 +102,8 @@ def choose_archives(splits: Iterable[str], what: str) -> tuple[Archive, ...]:
             found=", ".join(sorted(wanted)),
             advice="leave `split` out: one zip holds the grids of all splits",
         )
-    if what == SEQUENCES and not wanted:
-        raise ArgumentError("split", expected=f"one of {', '.join(known)}, all", found="none")
-    return tuple(
-        archive
-        for archive in ARCHIVES
-        if archive.what == what
-        and (archive.split is None or archive.split in wanted or "all" in wanted)
-    )
+    chosen = {None, *known} if "all" in wanted else {None, *wanted}
+    return tuple(a for a in ARCHIVES if a.what == what and a.split in chosen)
 
 
 @dataclass(frozen=True)
@@ -205,26 +199,30 @@ def download(
         make_folder(folder)
         remove_stale(folder)
     done = {archive: _extracted_before(folder, archive) for archive in archives if extract}
-    fetches = {}
-    for archive in archives:
-        if done.get(archive) is None:
-            url = archive.url if base_url is None else f"{base_url.rstrip('/')}/{archive.name}"
-            fetches[archive] = FileFetch(url, folder / archive.name, connections)
-    _check_space(folder, fetches, extract)
-    results = []
+    fetches, needed = {}, 0
     for archive in archives:
         path, before = folder / archive.name, done.get(archive)
-        if before is not None:
-            # a killed run can extract a zip and not remove it
-            if not keep and path.is_file() and path.stat().st_size == before.size:
-                with writing(path):
-                    remove_file(path)
-            results.append(before)
-            continue
-        fetch = fetches[archive]
-        fetched = _fetch(path, fetch, progress, 2e9 * archive.gigabytes)
-        result = Downloaded(archive.name, str(path), fetch.file.size, fetched)
-        results.append(_extract(result, folder, archive, keep, progress) if extract else result)
+        if before is None:
+            url = archive.url if base_url is None else f"{base_url.rstrip('/')}/{archive.name}"
+            fetch = fetches[archive] = FileFetch(url, path, connections)
+            needed += 0 if path.exists() else fetch.remaining()
+            # extracted files take about the same space
+            needed += (fetch.file.size or 0) if extract else 0
+        # a killed run can extract a zip and not remove it
+        elif not keep and path.is_file() and path.stat().st_size == before.size:
+            with writing(path):
+                remove_file(path)
+    check_space(folder, needed, "for the zips and the files in them" if extract else "for the zips")
+    results = []
+    for archive in archives:
+        result = done.get(archive)
+        if result is None:
+            path, fetch = folder / archive.name, fetches[archive]
+            fetched = _fetch(path, fetch, progress, 2e9 * archive.gigabytes)
+            result = Downloaded(archive.name, str(path), fetch.file.size, fetched)
+            if extract:
+                result = _extract(result, folder, archive, keep, progress)
+        results.append(result)
     return DownloadResult(tuple(results), time.perf_counter() - began)
 
 
@@ -285,14 +283,3 @@ def _extracted_before(folder: Path, archive: Archive) -> Downloaded | None:
 
 def _record(folder: Path, archive: Archive) -> Path:
     return folder / f"{archive.name}.unpacked.json"
-
-
-def _check_space(folder: Path, fetches: dict[Archive, FileFetch], extract: bool) -> None:
-    """Check the free space for all bytes to fetch, and for extracted files, which take about the
-    same space.
-    """
-    needed = 0
-    for archive, fetch in fetches.items():
-        needed += 0 if (folder / archive.name).exists() else fetch.remaining()
-        needed += (fetch.file.size or 0) if extract else 0
-    check_space(folder, needed, "for the zips and the files in them" if extract else "for the zips")

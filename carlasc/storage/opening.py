@@ -175,7 +175,6 @@ def _open_remote(tree: RemoteTree, cache: str | os.PathLike[str] | Cache | None)
             advice="pack the data into a .zarr, or leave `cache` out",
         )
     if is_file:
-        tree.check_ranges()
         return _open_file(tree, "")
     if cache is not None:
         return _open_folder(CachedTree(tree, cache if isinstance(cache, Cache) else Cache(cache)))

@@ -19,6 +19,7 @@ from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.transport.trees import Tree
 
 _DEPTH = 4  # <split>/<sequence>/<coordinates>, and one folder around them in some zips
+_TEXTS = (layout.POSES, layout.TIMES, layout.METADATA, layout.CAMERAS)
 _CONTAINERS = (".zip", ".zarr", ".h5", ".hdf5", ".parquet")
 
 
@@ -44,7 +45,8 @@ class PublishedSource(Source):
 
     def _nothing_found(self) -> MissingDataError:
         entries, expected = self.tree.entries(), "a sequence or a folder above it"
-        if layout.PARAMS in entries or any(_is_frame(name) for name in entries):
+        suffixes = {field.suffix for field in layout.SCAN_FIELDS.values()} | {".label", ".bin"}
+        if layout.PARAMS in entries or any(_is_frame(name, suffixes) for name in entries):
             found, advice = "the files of one field", "give the folder above this one"
         elif stores := sorted(name for name in entries if name.endswith(_CONTAINERS)):
             found, advice = ", ".join(stores[:4]), "give one of these"
@@ -79,26 +81,15 @@ class PublishedSequence(Sequence):
         Lists the folder of the sequence, and checks for params.json in the folder of each grid.
         """
         folders = {name for name, is_folder in self.tree.entries(self.path).items() if is_folder}
-        fields = {
-            name: field for name, field in layout.SCAN_FIELDS.items() if field.folder in folders
-        }
+        names = [name for name, field in layout.SCAN_FIELDS.items() if field.folder in folders]
         for folder in sorted(folders & layout.IMAGE_FOLDERS.keys()):
-            cameras = [
-                name for name, below in self.tree.entries(self._prefix + folder).items() if below
-            ]
-            names = [
-                f"{folder}.{camera}.{suffix}"
-                for camera in cameras
-                for suffix in layout.IMAGE_SUFFIXES
-            ]
-            fields |= {name: layout.field_named(name) for name in names}
+            for camera, is_folder in self.tree.entries(self._prefix + folder).items():
+                suffixes = layout.IMAGE_SUFFIXES if is_folder else ()
+                names += [f"{folder}.{camera}.{suffix}" for suffix in suffixes]
         for grid in sorted(folders - layout.scan_folders() - layout.IMAGE_FOLDERS.keys()):
             if self.tree.is_file(self._prefix + layout.params_file(grid)):
-                fields |= {
-                    f"{grid}/{part}": layout.field_named(f"{grid}/{part}")
-                    for part in layout.GRID_FIELDS
-                }
-        return fields
+                names += [f"{grid}/{part}" for part in layout.GRID_FIELDS]
+        return {name: layout.field_named(name) for name in names}
 
     @cached_property
     def _frames(self) -> dict[str, IntArray]:
@@ -111,7 +102,15 @@ class PublishedSequence(Sequence):
     def frames(self, field: str) -> IntArray:
         """Return the frames of a field. Its folder is listed once."""
         if field not in self._frames:
-            self._list_folder_of(field)
+            if field not in self._listing:
+                return np.empty(0, np.int64)
+            folder = self._listing[field].folder
+            names = self.tree.entries(self._prefix + folder)
+            # fields of a grid share a folder
+            for sibling in (f for f in self._listing.values() if f.folder == folder):
+                numbers = (layout.frame_of(name, sibling.suffix) for name in names)
+                found = sorted(number for number in numbers if number is not None)
+                self._frames[sibling.name] = np.array(found, np.int64)
         return self._frames[field]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -124,38 +123,19 @@ class PublishedSequence(Sequence):
             state, _frames={name: expand(frames) for name, frames in state["_frames"].items()}
         )
 
-    def _list_folder_of(self, field: str) -> None:
-        if field not in self._listing:
-            self._frames[field] = np.empty(0, np.int64)
-            return
-        folder = self._listing[field].folder
-        names = self.tree.entries(self._prefix + folder)
-        # fields of a grid share a folder
-        for sibling in (f for f in self._listing.values() if f.folder == folder):
-            numbers = [
-                number
-                for name in names
-                if (number := layout.frame_of(name, sibling.suffix)) is not None
-            ]
-            self._frames[sibling.name] = np.array(sorted(numbers), np.int64)
-
     def read(self, field: str, frame: int) -> AnyArray:
         """Read one file.
 
         A local file is memory-mapped: the array is read-only, and its bytes are read on access.
         """
-        entry = self._entry(field)
-        path = self._prefix + entry.file(frame)
-        shape = self._shape(entry)
-        return entry.decode(
-            self.tree.read(path, entry.size_of(shape)), self.tree.where(path), shape
-        )
+        return self.read_many(field, [frame])[0]
 
     def read_many(self, field: str, frames: Iterable[int]) -> list[AnyArray]:
         """Read several files; all at once from a remote tree."""
         entry = self._entry(field)
         paths = [self._prefix + entry.file(frame) for frame in frames]
-        shape = self._shape(entry)
+        with_shape = entry.per in ("voxel", "vote", "moving voxel")
+        shape = self.grids[entry.folder].size if with_shape else None
         files = zip(paths, self.tree.read_many(paths, entry.size_of(shape)), strict=True)
         return [entry.decode(data, self.tree.where(path), shape) for path, data in files]
 
@@ -172,24 +152,14 @@ class PublishedSequence(Sequence):
             )
         return self._listing[field]
 
-    def _shape(self, entry: field_files.Field) -> tuple[int, int, int] | None:
-        return (
-            self.grids[entry.folder].size
-            if entry.per in ("voxel", "vote", "moving voxel")
-            else None
-        )
-
     def documents(self) -> tuple[str, ...]:
         """Return the names of the text files."""
-        texts = (layout.POSES, layout.TIMES, layout.METADATA, layout.CAMERAS)
-        names = [name for name in texts if self.tree.is_file(self._prefix + name)]
         grids = sorted({field.folder for name, field in self._listing.items() if "/" in name})
-        reports = [
-            layout.report_file(grid)
-            for grid in grids
-            if self.tree.is_file(self._prefix + layout.report_file(grid))
-        ]
-        return (*names, *(layout.params_file(grid) for grid in grids), *reports)
+        texts, reports = (
+            [name for name in names if self.tree.is_file(self._prefix + name)]
+            for names in (_TEXTS, map(layout.report_file, grids))
+        )
+        return (*texts, *map(layout.params_file, grids), *reports)
 
     def read_document(self, name: str) -> bytes:
         """Return a text file's bytes."""
@@ -199,27 +169,22 @@ class PublishedSequence(Sequence):
         """Return the files and folders of the sequence that are not part of the layout; names of
         folders end in "/".
         """
-        known = {field.folder for field in self._listing.values()}
-        texts = {layout.POSES, layout.TIMES, layout.METADATA, layout.CAMERAS}
-        known |= {folder.partition("/")[0] for folder in known}
-        entries = self.tree.entries(self.path)
+        suffixes: dict[str, set[str]] = {}
+        for field in self._listing.values():
+            suffixes.setdefault(field.folder, set()).add(field.suffix)
+        known = {folder.partition("/")[0] for folder in suffixes}
         unknown = [
             f"{name}/" if is_folder else name
-            for name, is_folder in entries.items()
-            if name not in known | texts | {layout.DERIVED}
+            for name, is_folder in self.tree.entries(self.path).items()
+            if name not in {*known, *_TEXTS, layout.DERIVED}
         ]
-        for folder in sorted(known - layout.IMAGE_FOLDERS.keys()):
-            suffixes = {field.suffix for field in self._listing.values() if field.folder == folder}
-            for name in self.tree.entries(self._prefix + folder):
-                frames = [
-                    number
-                    for suffix in suffixes
-                    if (number := layout.frame_of(name, suffix)) is not None
-                ]
-                if not frames and not (
-                    name in (layout.PARAMS, layout.REPORT) and folder not in layout.scan_folders()
-                ):
-                    unknown.append(f"{folder}/{name}")
+        for folder, of_fields in suffixes.items():
+            of_grid = () if folder in layout.scan_folders() else (layout.PARAMS, layout.REPORT)
+            unknown += [
+                f"{folder}/{name}"
+                for name in self.tree.entries(self._prefix + folder)
+                if name not in of_grid and not _is_frame(name, of_fields)
+            ]
         return tuple(sorted(unknown))
 
 
@@ -247,6 +212,5 @@ def _find_sequences(tree: Tree, path: str, depth: int) -> Iterator[str]:
             yield from _find_sequences(tree, f"{path}/{name}" if path else name, depth - 1)
 
 
-def _is_frame(name: str) -> bool:
-    suffixes = {field.suffix for field in layout.SCAN_FIELDS.values()} | {".label", ".bin"}
+def _is_frame(name: str, suffixes: Iterable[str]) -> bool:
     return any(layout.frame_of(name, suffix) is not None for suffix in suffixes)

@@ -22,7 +22,7 @@ from carlasc.dataset import Dataset, ShardSampler, sampling
 from carlasc.storage.packing import pack
 
 pytest.importorskip("torch", reason="needs carlasc[torch]")
-pytest.importorskip("aiohttp")
+pytest.importorskip("urllib3")
 pytest.importorskip("zarr")
 
 from torch.utils.data import DataLoader

@@ -108,7 +108,7 @@ def test_a_run_that_is_stopped_in_the_middle_of_an_epoch_ends_with_the_same_weig
         assert torch.equal(value, found[name]), name
 
 
-@pytest.mark.needs("zarr", "aiohttp")
+@pytest.mark.needs("zarr", "urllib3")
 def test_training_from_a_server_gives_the_weights_of_training_from_disk(data, tmp_path):
     store = pack(data, tmp_path / "served" / "data.zarr").out
     here = train(store, replace(QUICK, epochs=1), tmp_path / "here", ALONE)

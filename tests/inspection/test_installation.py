@@ -152,7 +152,7 @@ def test_json_holds_the_same_figures():
     assert ran.exit_code == 0
     assert found["version"] == carlasc.__version__
     assert {package["name"] for package in found["packages"]} == {
-        "aiohttp",
+        "filelock",
         "fsspec",
         "lazy-loader",
         "numba",
@@ -160,6 +160,7 @@ def test_json_holds_the_same_figures():
         "numpy",
         "rich",
         "typer",
+        "urllib3",
     }
     assert found["processor"]["usable"] >= 1 and found["compiled"]["compile_s"] > 0
     assert found["compiled"]["writable"] is True

@@ -170,7 +170,7 @@ def test_a_stream_that_always_breaks_is_given_up_and_leaves_no_complete_file(
     site: Site, tmp_path: Path
 ) -> None:
     site.ranges, site.drop_after = False, 50_000
-    with pytest.raises(CarlascError, match="in 7 attempts.*again"):
+    with raises(CarlascError, problem="failed at each attempt", advice="again"):
         get(site, tmp_path)
     assert "val_cartesian.zip" not in names(tmp_path)
 
@@ -216,7 +216,7 @@ def test_a_redirection_that_leads_to_no_web_server_or_nowhere_is_refused_at_once
 
 def test_bytes_under_a_wrong_content_range_are_never_taken(site: Site, tmp_path: Path) -> None:
     site.shift_range = 16
-    with raises(CarlascError, found="expected bytes"):
+    with raises(CarlascError, problem="last with expected bytes"):
         get(site, tmp_path)
     assert "val_cartesian.zip" not in names(tmp_path)
 
@@ -379,7 +379,7 @@ def test_a_server_that_fails_is_asked_again(site: Site, tmp_path: Path) -> None:
 
 def test_a_server_that_always_fails_is_given_up(site: Site, tmp_path: Path) -> None:
     site.status = 503
-    with raises(CarlascError, expected="data", found=r"none in 7 attempts \(503\)"):
+    with raises(CarlascError, problem="failed at each attempt, last with 503"):
         get(site, tmp_path)
     assert len(site.requests) == 7
 
@@ -432,22 +432,12 @@ def test_a_stream_that_changes_begins_again(site: Site, tmp_path: Path) -> None:
     assert seen[-1] == len(changed)
 
 
-@pytest.mark.parametrize(
-    ("off", "message"),
-    [
-        # aiohttp may see the byte too many
-        (
-            -1,
-            r"found a Content-Length of|none in 7 attempts \(ClientResponseError\)",
-        ),
-        (1, "found a Content-Length of"),
-    ],
-)
+@pytest.mark.parametrize("off", [-1, 1])
 def test_a_length_that_is_not_that_of_the_range_is_not_believed(
-    site: Site, tmp_path: Path, off: int, message: str
+    site: Site, tmp_path: Path, off: int
 ) -> None:
     site.length_off = off
-    with pytest.raises(CarlascError, match=message):
+    with raises(CarlascError, problem="found a Content-Length of"):
         get(site, tmp_path)
     assert "val_cartesian.zip" not in names(tmp_path)
 

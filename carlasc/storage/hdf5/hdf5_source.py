@@ -22,7 +22,6 @@ from carlasc.storage.packed.array_source import ArraySource, ArrayStore
 from carlasc.storage.packed.chunks import Encoding, StoredArray, crc32c
 from carlasc.storage.transport.remote_tree import RemoteTree
 from carlasc.storage.transport.trees import Tree
-from carlasc.storage.transport.web import garbage_collection_paused
 
 _BLOSC = 32001  # registered number of the filter
 _GZIP, _SHUFFLE, _FLETCHER32 = 1, 2, 3  # filters of HDF5 itself
@@ -111,11 +110,7 @@ class HDF5Store(ArrayStore):
         h5py = import_extra("h5py", "hdf5")
         with reading(self.location, "an HDF5 file", "the file may be truncated or corrupted"):
             if isinstance(self.tree, RemoteTree):
-                with (
-                    self.tree.open(self.path) as remote,
-                    garbage_collection_paused(),
-                    h5py.File(remote, "r") as file,
-                ):
+                with self.tree.open(self.path) as remote, h5py.File(remote, "r") as file:
                     yield file
             else:
                 with h5py.File(self.location, "r", locking=False) as file:

@@ -11,12 +11,12 @@ import hashlib
 import os
 import stat
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from filelock import FileLock, Timeout
 
@@ -30,8 +30,9 @@ _AT_ONCE = 4  # ranges of a file that are requested in parallel; all of them are
 _LARGEST_SHARE = 4  # files above 1/4 of the cache size are read without the cache
 _PART = ".part"
 _LOCKS = ".locks"  # the folder of locks
-_TOUCH_S = 0.5  # precision of the time of the last use
 _FULL_S = 60.0  # pause of fetching after the disk was full
+
+_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True)
@@ -91,13 +92,10 @@ class Cache:
         """Return the name of the cached file with a key, if it was compared with the remote file
         after `since`; otherwise None.
         """
-        with suppress(FileNotFoundError), os.scandir(Path(self.folder) / key[:2]) as entries:
-            for entry in entries:
-                if entry.name.startswith(f"{key}-") and not entry.name.endswith(_PART):
-                    with suppress(FileNotFoundError):  # removed meanwhile
-                        about = entry.stat()
-                        if about.st_mtime >= since and about.st_size == _size_of(entry.name):
-                            return entry.name
+        for path in self.path(key).parent.glob(f"{key}-*[0-9]"):  # not those of which a part exists
+            with suppress(FileNotFoundError):  # removed meanwhile
+                if _is_whole(path) and path.stat().st_mtime >= since:
+                    return path.name
         return None
 
     def add(self, name: str, fill: Callable[[int], None], *, wait: bool = True) -> bool:
@@ -136,19 +134,15 @@ class Cache:
             return True
         return False
 
-    def touch(self, name: str, *, compared: bool = False) -> bool:
+    def touch(self, name: str, *, compared: bool = False) -> None:
         """Record that a file is used, and whether it was `compared` with the remote file.
 
-        Return whether it still exists.
+        Raises:
+            FileNotFoundError: it was removed to make room.
         """
         path, now = self.path(name), time.time_ns()
-        try:
+        with suppress(PermissionError):  # it belongs to another user: its times cannot be set
             os.utime(path, ns=(now, now if compared else path.stat().st_mtime_ns))
-        except FileNotFoundError:
-            return False  # removed to make room
-        except OSError:  # it belongs to another user: its times cannot be set
-            return True
-        return True
 
     def _make_room(self, descriptor: int, size: int) -> bool:
         """Remove the oldest files as needed, and set the size of a new file.
@@ -156,9 +150,14 @@ class Cache:
         Return whether there is room for it.
         """
         with self._lock(""):
-            files = sorted(_files(Path(self.folder)))
+            files = []
+            for path in Path(self.folder).glob("??/*"):
+                with suppress(FileNotFoundError):  # renamed meanwhile
+                    about = path.stat()
+                    if stat.S_ISREG(about.st_mode):
+                        files.append((about.st_atime_ns, about.st_size, path))
             excess = sum(length for _, length, _ in files) + size - self.max_bytes
-            for _, length, path in files:
+            for _, length, path in sorted(files):
                 if excess <= 0:
                     break
                 if self._remove(path):
@@ -200,9 +199,8 @@ class CachedTree(Tree):
         self._forget()
 
     def _forget(self) -> None:
-        self._names: dict[str, str] = {}  # path -> name in the cache
-        self._used: dict[str, float] = {}  # name -> time when this process last recorded its use
-        self._too_large: set[str] = set()
+        # path -> name in the cache; None if the file is too large for it
+        self._names: dict[str, str | None] = {}
         self._full_until = 0.0
 
     def entries(self, folder: str = "") -> Mapping[str, bool]:
@@ -215,13 +213,11 @@ class CachedTree(Tree):
 
     def read(self, path: str, size: int | None = None) -> bytes | memoryview:
         """Map the cached file into memory."""
-        cached = self._from_cache(path, lambda tree, name: tree.read(name))
-        return self.remote.read(path) if cached is None else cached
+        return self._use(path, lambda tree, name: tree.read(name))
 
     def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
         """Read the range of the cached file."""
-        cached = self._from_cache(path, lambda tree, name: tree.read_range(name, start, end))
-        return self.remote.read_range(path, start, end) if cached is None else cached
+        return self._use(path, lambda tree, name: tree.read_range(name, start, end))
 
     def fetch(self, path: str, *, wait: bool = True) -> bool:
         """Fetch a file into the cache, or record that it will be used.
@@ -236,59 +232,50 @@ class CachedTree(Tree):
         Raises:
             CarlascError: the file does not exist, or the server does not answer.
         """
-        for _ in range(2):
-            name = self._find(path, wait)
-            if name is None or self.cache.touch(name):
-                return name is not None
-            self._names.pop(path, None)  # removed to make room: fetched again
-        return False
+        return self._use(path, lambda tree, _: tree is not self.remote, wait)
 
-    def _from_cache(
-        self, path: str, read: Callable[[LocalTree, str], bytes | memoryview]
-    ) -> bytes | memoryview | None:
+    def _use(self, path: str, use: Callable[[Tree, str], _Result], wait: bool = True) -> _Result:
+        """Call `use` with a tree and the name of a file in it: the cached file, whose use is
+        recorded, or the remote file if it must be read without the cache.
+        """
         for _ in range(2):
-            name = self._find(path)
-            if name is None:
-                return None
-            place = self.cache.path(name)
             try:
-                data = read(_CacheFolder(place.parent, self.where(path)), name)
-            except MissingDataError:
-                self._names.pop(path, None)  # removed to make room: fetched again
-                continue
-            if time.monotonic() - self._used.get(name, -_TOUCH_S) >= _TOUCH_S:
-                self._used[name] = time.monotonic()
+                if (name := self._find(path, wait)) is None:
+                    break
+                result = use(_CacheFolder(self.cache.path(name).parent, self.where(path)), name)
                 self.cache.touch(name)
-            return data
-        return None
+                return result
+            except (MissingDataError, FileNotFoundError):
+                if self._names.pop(path, None) is None:
+                    raise  # the remote file does not exist
+                # removed to make room: fetched again
+        return use(self.remote, path)
 
-    def _find(self, path: str, wait: bool = True) -> str | None:
+    def _find(self, path: str, wait: bool) -> str | None:
         """Return the name of a file in the cache, fetching it if necessary; None if it must be read
         without the cache.
         """
-        if (name := self._names.get(path)) is not None:
-            return name
-        if path in self._too_large:
-            return None
-        key = self._key(path)
-        name = self.cache.find(key, self._opened)
-        if name is None:
-            size, version = self.remote.version(path)
-            if size > self.cache.max_bytes // _LARGEST_SHARE:
-                self._too_large.add(path)
-                return None
-            name = f"{key}-{_digest(version)[:16]}-{size}"
-            if not self._add(path, name, wait):
-                return None
-            self.cache.touch(name, compared=True)
-        self._names[path] = name
-        return name
+        if path not in self._names:
+            key = self._key(path)
+            name = self.cache.find(key, self._opened)
+            if name is None:
+                size, version = self.remote.version(path)
+                if size > self.cache.max_bytes // _LARGEST_SHARE:
+                    self._names[path] = None
+                    return None
+                name = f"{key}-{_digest(version)[:16]}-{size}"
+                if not self._add(path, name, size, wait):
+                    return None
+                self._names[path] = name
+                self.cache.touch(name, compared=True)
+            self._names[path] = name
+        return self._names[path]
 
-    def _add(self, path: str, name: str, wait: bool) -> bool:
+    def _add(self, path: str, name: str, size: int, wait: bool) -> bool:
         if time.monotonic() < self._full_until:
             return _is_whole(self.cache.path(name))
         try:
-            return self.cache.add(name, partial(self._fill, path, _size_of(name)), wait=wait)
+            return self.cache.add(name, partial(self._fill, path, size), wait=wait)
         except OSError:  # the disk is full: the file is read from the server
             self._full_until = time.monotonic() + _FULL_S
             return False
@@ -305,15 +292,12 @@ class CachedTree(Tree):
 
     def _key(self, path: str) -> str:
         options = self.remote.client.options
-        endpoint = (
-            options.get("endpoint_url")
-            or dict(options.get("client_kwargs") or {}).get("endpoint_url")
-            or ""
-        )
+        more = options.get("client_kwargs", {})
+        endpoint = options.get("endpoint_url") or more.get("endpoint_url", "")
         return _digest(f"{endpoint}\n{self.location}\n{path}")[:32]
 
     def __getstate__(self) -> dict[str, Any]:
-        own = ("_names", "_used", "_too_large", "_full_until")
+        own = ("_names", "_full_until")
         return {name: value for name, value in self.__dict__.items() if name not in own}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -346,19 +330,6 @@ def _is_whole(path: Path) -> bool:
         return path.stat().st_size == _size_of(path.name)
     except FileNotFoundError:
         return False
-
-
-def _files(folder: Path) -> Iterator[tuple[int, int, Path]]:
-    """Yield the last use, the size and the path of each file in the cache."""
-    for place in folder.iterdir():
-        if place.name == _LOCKS:
-            continue
-        with suppress(FileNotFoundError, NotADirectoryError), os.scandir(place) as entries:
-            for entry in entries:
-                with suppress(FileNotFoundError):  # renamed meanwhile
-                    about = entry.stat()
-                    if stat.S_ISREG(about.st_mode):
-                        yield about.st_atime_ns, about.st_size, Path(entry.path)
 
 
 def _digest(text: str) -> str:

@@ -15,8 +15,7 @@ from typing import NoReturn
 from carlasc.errors import CarlascError, MissingDataError, StorageError
 
 TEMPORARY: Mapping[str, tuple[str, ...]] = {
-    "aiohttp": ("ClientConnectionError", "ClientPayloadError"),
-    "aiohttp.http_exceptions": ("HttpProcessingError",),
+    "urllib3.exceptions": ("TimeoutError", "ProtocolError", "NewConnectionError", "SSLError"),
     "requests.exceptions": ("ConnectionError", "ChunkedEncodingError"),
     "http.client": ("IncompleteRead",),
     "httpx": ("TransportError",),
@@ -37,13 +36,29 @@ class WrongAnswerError(Exception):
     """The answer of a server does not fit the request. The request is sent again."""
 
 
+class WholeFileError(WrongAnswerError):
+    """The answer of a server is the whole file instead of a range."""
+
+
+class StatusError(Exception):
+    """A web server answered with a status of 300 or more.
+
+    Attributes:
+        status: the HTTP status.
+    """
+
+    def __init__(self, status: int) -> None:
+        super().__init__(f"status {status}")
+        self.status = status
+
+
 def is_temporary(error: BaseException) -> bool:
     """Whether a request that failed with an error may succeed when it is sent again."""
     if is_offline(error):
         return False
     if _is_of_connection(error):
         return True
-    status, _ = _status_and_code(error)
+    status, _ = status_and_code(error)
     if status is not None:
         return status in _BUSY or (status >= 500 and status != 501)  # 501: not implemented
     if _is_of_obstore(error):
@@ -56,16 +71,6 @@ def is_offline(error: BaseException) -> bool:
     set.
     """
     return type(error).__name__ == "OfflineModeIsEnabled"
-
-
-def ends_before(error: BaseException) -> bool:
-    """Whether a request failed because its range starts after the end of the file."""
-    return _status_and_code(error)[0] == 416
-
-
-def bucket_is_missing(error: BaseException) -> bool:
-    """Whether the bucket of an S3 URL does not exist."""
-    return _status_and_code(error)[1] == "NoSuchBucket"
 
 
 def fail(where: str, error: BaseException, *, writing: bool = False) -> NoReturn:
@@ -86,11 +91,10 @@ def fail(where: str, error: BaseException, *, writing: bool = False) -> NoReturn
     """
     if isinstance(error, CarlascError):
         raise error
-    status, code = _status_and_code(error)
-    kind: type[CarlascError] = StorageError if writing else CarlascError
-    verb = "cannot be written" if writing else "cannot be read"
+    status, code = status_and_code(error)
+    kind, missing = (StorageError,) * 2 if writing else (CarlascError, MissingDataError)
     if code == "NoSuchBucket":
-        raise (StorageError if writing else MissingDataError)(
+        raise missing(
             where,
             expected="a bucket that exists",
             found="no such bucket",
@@ -98,58 +102,58 @@ def fail(where: str, error: BaseException, *, writing: bool = False) -> NoReturn
         ) from None
     if isinstance(error, FileNotFoundError) and not writing:
         raise MissingDataError(where, expected="a file", found="nothing") from None
-    if _lacks_credentials(error):
-        raise kind(
+    if isinstance(error, WholeFileError):
+        raise CarlascError(
             where,
-            problem=f"{verb}: no credentials were found",
-            advice="set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or FSSPEC_S3_ANON=true for a "
-            "public bucket",
+            expected="a server that supports range requests",
+            found="a server without them",
+            advice="download the file first",
         ) from None
-    if "incorrectly configured region" in str(error):
-        raise kind(
-            where,
-            problem=f"{verb}: the bucket is in another region",
-            advice="set AWS_REGION to the region of the bucket",
-        ) from None
-    if isinstance(error, PermissionError) or status in (401, 403):
-        raise kind(
-            where,
-            problem=f"{verb}: access was refused ({code or status or 'no permission'})",
-            advice="check the credentials and their permissions",
-        ) from None
-    if is_offline(error):
-        raise kind(
-            where, problem=f"{verb}: HF_HUB_OFFLINE is set", advice="unset it to use the network"
-        ) from None
-    if is_temporary(error):
-        raise kind(
-            where,
-            problem=f"{verb}: the server failed at each attempt, last with "
-            f"{describe_failure(error)}",
-            advice="try again later",
-        ) from None
-    raise kind(where, problem=f"{verb}: {describe_failure(error)}") from None
+    refused = isinstance(error, PermissionError) or status in (401, 403)
+    failure = describe_failure(error)
+    reasons = (
+        (
+            _lacks_credentials(error),
+            "no credentials were found",
+            "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or FSSPEC_S3_ANON=true for a public "
+            "bucket",
+        ),
+        (
+            "incorrectly configured region" in str(error),
+            "the bucket is in another region",
+            "set AWS_REGION to the region of the bucket",
+        ),
+        (
+            refused,
+            f"access was refused ({code or status or 'no permission'})",
+            "check the credentials and their permissions",
+        ),
+        (is_offline(error), "HF_HUB_OFFLINE is set", "unset it to use the network"),
+        (
+            is_temporary(error),
+            f"the server failed at each attempt, last with {failure}",
+            "try again later",
+        ),
+        (True, failure, ""),
+    )
+    problem, advice = next(reason for applies, *reason in reasons if applies)
+    verb = "cannot be written" if writing else "cannot be read"
+    raise kind(where, problem=f"{verb}: {problem}", advice=advice) from None
 
 
 def describe_failure(error: BaseException) -> str:
     """Describe an error of a request without credentials: its status, its code or the name of its
     class.
     """
-    status, code = _status_and_code(error)
+    status, code = status_and_code(error)
     if isinstance(error, WrongAnswerError):
         return str(error)
     if _is_of_obstore(error) and status is None:
         return "no answer, or one that does not fit the request"
-    parts = [str(status) if status else "", code if code != str(status) else ""]
-    if text := " ".join(part for part in parts if part):
-        return text
-    reason = getattr(error, "strerror", None)
-    name = type(error).__name__
-    return (
-        f"{name} ({reason})"
-        if isinstance(reason, str) and type(error).__module__ == "builtins"
-        else name
-    )
+    if status:
+        return f"{status} {code}".strip()
+    name, reason = type(error).__name__, getattr(error, "strerror", None)
+    return f"{name} ({reason})" if reason and isinstance(error, OSError) else name
 
 
 def _is_of_obstore(error: BaseException) -> bool:
@@ -161,33 +165,28 @@ def _lacks_credentials(error: BaseException) -> bool:
 
 
 def _is_of_connection(error: BaseException) -> bool:
-    """Whether an error, or one of its causes, is a connection error. aiohttp gives answers that are
-    not HTTP an artificial status.
-    """
-    kinds = [
-        getattr(sys.modules[module], name, ())
+    """Whether an error, or one of its causes, is a connection error."""
+    kinds = tuple(
+        getattr(sys.modules[module], name)
         for module, names in TEMPORARY.items()
         if module in sys.modules
         for name in names
-    ]
-    return any(isinstance(cause, kind) for cause in _causes(error) for kind in kinds)
+        if hasattr(sys.modules[module], name)
+    )
+    return any(isinstance(cause, kinds) for cause in _causes(error))
 
 
-def _causes(error: BaseException) -> Iterator[BaseException]:
-    cause: BaseException | None = error
-    for _ in range(5):
-        if cause is None:
-            return
-        yield cause
-        cause = cause.__cause__
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    while error is not None:
+        yield error
+        error = error.__cause__
 
 
-def _status_and_code(error: BaseException) -> tuple[int | None, str]:
+def status_and_code(error: BaseException) -> tuple[int | None, str]:
     """Return the HTTP status of an error, and the code of an S3 error ("NoSuchBucket"), if it has
     them.
     """
-    # payload errors of aiohttp have another "code"
-    for cause in () if _is_of_connection(error) else _causes(error):
+    for cause in _causes(error):
         if match := _STATUS.search(str(cause)):  # obstore; its missing objects are not its errors
             code = _CODE.search(str(cause))
             return int(match[1]), code[1] if code else ""

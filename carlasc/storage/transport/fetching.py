@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from carlasc.errors import (
     CarlascError,
@@ -39,24 +39,23 @@ from carlasc.storage.files import (
     writing,
 )
 from carlasc.storage.transport.failures import (
+    StatusError,
     WrongAnswerError,
-    describe_failure,
     fail,
     is_temporary,
 )
 from carlasc.storage.transport.requests import persist
-from carlasc.storage.transport.web import HttpAnswer, WebClient
+from carlasc.storage.transport.web import PARTIAL, WebClient
 
 _ZIP = b"PK"
 _GONE = (401, 403, 404, 410)
-_PARTIAL = 206
 _BLOCK = 16 << 20  # bytes per request
 _RESTARTS = 3  # after the file has changed
 
 _Result = TypeVar("_Result")
 
 
-class _ChangedError(Exception):
+class _ChangedError(FormatError):
     """The file on the server is not the one of which the transfer began, or it came whole where a
     range was requested.
     """
@@ -129,21 +128,22 @@ class FileFetch:
                 continues with the fetched bytes.
             StorageError: the disk is full or fails.
         """
-        for _ in range(_RESTARTS):
+        for restart in range(_RESTARTS):
+            if restart:
+                self._part.unlink(missing_ok=True)
+                self._record.unlink(missing_ok=True)
+                self.file = self._persist(self._probe)
             got = self._load()
             resumed = sum(got.values())
             advance(resumed)
             try:
                 self._fetch(got, advance, most)
-                self._finish(sum(got.values()))
+                self._finish()
                 return resumed
             except OSError as error:
                 raise storage_error(self._path, error) from error
             except _ChangedError:
                 advance(-sum(got.values()))
-                self._part.unlink(missing_ok=True)
-                self._record.unlink(missing_ok=True)
-                self.file = self._persist(self._probe)
         raise FormatError(
             self._where,
             expected="a file that does not change",
@@ -227,7 +227,8 @@ class FileFetch:
         is a zip.
         """
         with self._answer({"Range": f"bytes=0-{len(_ZIP) - 1}"}) as answer:
-            ranges, start = answer.status == _PARTIAL, answer.first[: len(_ZIP)]
+            ranges = answer.status == PARTIAL
+            start = answer.read(len(_ZIP))
             if start != _ZIP:
                 content = answer.headers.get("Content-Type", "data of unknown type")
                 raise FormatError(
@@ -236,36 +237,34 @@ class FileFetch:
                     found=f"{content} that begins with {start!r}",
                     advice="check the URL: the file may have moved",
                 )
-            return ServedFile(
-                _total(answer) if ranges else _length(answer), _validator(answer), ranges
-            )
+            total = answer.headers.get("Content-Range", "").partition("/")[2]
+            size = _number(total) if ranges else _length(answer)
+            if ranges and size is None:
+                raise WrongAnswerError("no size in Content-Range")
+            return ServedFile(size, _validator(answer), ranges)
 
     def _body(self, start: int, end: int) -> Iterator[bytes]:
         """Yield the bytes [start, end) in pieces; the whole file if the server has no ranges.
 
         Checks that all headers of the answer fit the request.
         """
-        file, count = self.file, self.file.size
-        headers = {"Range": f"bytes={start}-{end - 1}"} if file.ranges else {}
-        if file.ranges and file.validator is not None and not file.validator.startswith("W/"):
-            headers["If-Range"] = file.validator
-        with self._answer(headers) as answer:
-            if file.validator is not None and _validator(answer) not in (file.validator, None):
-                raise _ChangedError
-            if file.ranges:
-                if answer.status != _PARTIAL or _total(answer) != file.size:
-                    raise _ChangedError
-                count, expected = end - start, f"bytes {start}-{end - 1}/{file.size}"
-                if (header := answer.headers.get("Content-Range", "")) != expected:
-                    raise WrongAnswerError(f"expected {expected}, found {header}")
-            if _length(answer) not in (None, count):
-                if not file.ranges:
-                    raise _ChangedError
+        file = self.file
+        left = end - start if file.ranges else file.size
+        with self._answer({"Range": f"bytes={start}-{end - 1}"} if file.ranges else {}) as answer:
+            found = answer.headers.get("Content-Range", "")
+            if (
+                _validator(answer) not in (file.validator, None)
+                or (file.ranges and not found.endswith(f"/{file.size}"))
+                or (not file.ranges and _length(answer) not in (None, left))
+            ):
+                raise _ChangedError(self._where)
+            if file.ranges and found != f"bytes {start}-{end - 1}/{file.size}":
+                raise WrongAnswerError(f"expected bytes {start}-{end - 1}, found {found}")
+            if _length(answer) not in (None, left):
                 raise WrongAnswerError(
-                    f"expected {count} bytes, found a Content-Length of {_length(answer)}"
+                    f"expected {left} bytes, found a Content-Length of {_length(answer)}"
                 )
-            left = count
-            for data in answer.pieces():  # what follows the expected bytes is not read
+            for data in self._client.pieces(answer):  # what follows the expected bytes is not read
                 yield data if left is None else data[:left]
                 if left is not None and (left := max(0, left - len(data))) == 0:
                     return
@@ -273,16 +272,16 @@ class FileFetch:
                 raise WrongAnswerError(f"the connection ended {left} bytes early")
 
     @contextmanager
-    def _answer(self, headers: dict[str, str]) -> Iterator[HttpAnswer]:
-        with self._client.answer(headers) as answer:
+    def _answer(self, headers: dict[str, str]) -> Iterator[Any]:
+        with self._client.answer(self._client.url, headers) as answer:
             if answer.status in _GONE:
                 raise MissingDataError(
                     self._where,
                     expected="a file",
                     found=f"status {answer.status} ({answer.reason})",
                 )
-            if answer.error is not None:
-                raise answer.error
+            if answer.status >= 300:
+                raise StatusError(answer.status)
             yield answer
 
     def _persist(
@@ -291,24 +290,11 @@ class FileFetch:
         count: Callable[[], int] = lambda: 0,
         stop: threading.Event | None = None,
     ) -> _Result:
-        """Call `work`, again after temporary failures.
-
-        If all attempts fail, raise a one-line error about the last failure.
-        """
+        """Call `work`, again after temporary failures (see `persist` and `fail`)."""
         try:
             return persist(work, self._client.settings, count, stop)
-        except (CarlascError, _ChangedError):
-            raise
         except Exception as error:
-            if is_temporary(error):
-                raise CarlascError(
-                    self._where,
-                    expected="data",
-                    found=f"none in {self._client.settings.attempts} attempts "
-                    f"({describe_failure(error)})",
-                    advice="run the same command again to continue",
-                ) from None
-            if isinstance(error, OSError):
+            if isinstance(error, OSError) and not is_temporary(error):
                 raise  # of the disk
             fail(self._where, error)
 
@@ -339,19 +325,8 @@ class FileFetch:
         counts = {str(block): count for block, count in sorted(got.items())}
         write_json(self._record, {**self._about, "got": counts})
 
-    def _finish(self, total: int) -> None:
-        """Rename the file if it is complete: it has all bytes, and the central directory at the end
-        of a zip.
-        """
-        size, expected = self._part.stat().st_size, self.file.size
-        if expected is not None and (total != expected or size != expected):
-            found = str(min(size, total))
-            raise FormatError(
-                self._path,
-                expected=f"{expected} bytes",
-                found=found,
-                advice="run the same command again",
-            )
+    def _finish(self) -> None:
+        """Rename the file if it is a whole zip: it has the central directory at its end."""
         with self._part.open("rb") as file:
             if not zipfile.is_zipfile(file):
                 advice = f"remove {self._part.name} and run again"
@@ -363,19 +338,13 @@ class FileFetch:
         self.discard_record()
 
 
-def _validator(answer: HttpAnswer) -> str | None:
+def _validator(answer: Any) -> str | None:
     return answer.headers.get("ETag") or answer.headers.get("Last-Modified")
 
 
-def _length(answer: HttpAnswer) -> int | None:
-    text = answer.headers.get("Content-Length", "")
+def _length(answer: Any) -> int | None:
+    return _number(answer.headers.get("Content-Length", ""))
+
+
+def _number(text: str) -> int | None:
     return int(text) if re.fullmatch("[0-9]{1,18}", text) else None
-
-
-def _total(answer: HttpAnswer) -> int:
-    """Return the size of the whole file, from Content-Range."""
-    text = answer.headers.get("Content-Range", "")
-    match = re.fullmatch(r"bytes [0-9]+-[0-9]+/([0-9]{1,18})", text)
-    if match is None:
-        raise WrongAnswerError(f"expected a Content-Range, found {text!r}")
-    return int(match[1])

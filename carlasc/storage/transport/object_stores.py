@@ -13,17 +13,16 @@ import threading
 from collections.abc import Iterable, Mapping
 from datetime import timedelta
 from importlib.machinery import ExtensionFileLoader, ModuleSpec
-from importlib.util import module_from_spec, spec_from_file_location
+from importlib.util import module_from_spec
 from pathlib import Path
 from types import ModuleType
-from typing import Any, cast
+from typing import Any
 
 from carlasc.errors import ArgumentError, CarlascError, import_extra, without_credentials
 from carlasc.storage.transport.clients import Client
 from carlasc.storage.transport.failures import (
     WrongAnswerError,
-    bucket_is_missing,
-    ends_before,
+    status_and_code,
 )
 
 SCHEMES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl")
@@ -47,6 +46,8 @@ _S3_NAMES = {
     "region_name": "region",
     "anon": "skip_signature",
 }
+_GOOGLE_NAMES = {"token": "service_account", "anon": "skip_signature"}
+_NAMES = {"s3": _S3_NAMES, "s3a": _S3_NAMES, "gs": _GOOGLE_NAMES, "gcs": _GOOGLE_NAMES}
 
 
 class ObjectStoreClient(Client):
@@ -61,27 +62,25 @@ class ObjectStoreClient(Client):
 
     def open(self) -> tuple[Any, Any]:
         """Return two stores of the bucket, to read and to write: they have other time limits."""
-        config = self._config()
-        address = str(
-            config.get("endpoint") or _variable("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL")
-        )
+        given = {**self.options, **self.options.get("client_kwargs", {})}
+        given.pop("client_kwargs", None)
+        names = _NAMES.get(self.scheme, {"anon": "skip_signature"})
+        config = {names.get(name, name): value for name, value in given.items()}
+        if config.get("service_account") == "anon":
+            config = {"skip_signature": True}
+        provider = self._provider(config) if self.scheme in _S3 else None
+        address = str(config.get("endpoint", ""))
         silence = timedelta(seconds=self.settings.timeout_s)
         limits = (
             {"read_timeout": silence, "timeout": timedelta(days=1)},
             {"timeout": silence * _UPLOAD_TIMES},
         )
-        if self.scheme in _S3:
-            provider = self._profile(config)
-            if address:
-                config["endpoint"] = address
-        else:
-            provider = None
-        root = self._root.replace("s3a://", "s3://").replace("gcs://", "gs://")
+        scheme = {"s3a": "s3", "gcs": "gs"}.get(self.scheme, self.scheme)
         library = _library()
         try:
             reading, writing = (
                 library.store.from_url(
-                    root,
+                    self._root.replace(self.scheme, scheme, 1),
                     config=config,
                     client_options={
                         "allow_http": address.startswith("http://"),
@@ -109,32 +108,17 @@ class ObjectStoreClient(Client):
             ) from None
         return reading, writing
 
-    def _config(self) -> dict[str, Any]:
-        """Return the options, and those in variables such as FSSPEC_S3_ANON, in obstore's names."""
-        from fsspec.config import conf
-
-        given = {**conf.get(self.scheme, {}), **self.options}
-        given |= given.pop("client_kwargs", {})
-        if self.scheme in _S3:
-            return {_S3_NAMES.get(name, name): value for name, value in given.items()}
-        if given.get("token") == "anon" or given.pop("anon", False):
-            given["skip_signature"] = True
-        if token := given.pop("token", None) if self.scheme in ("gs", "gcs") else None:
-            given |= {} if token == "anon" else {"service_account": token}
-        return given
-
     @staticmethod
-    def _profile(config: dict[str, Any]) -> Any:
-        """Return the credentials of ~/.aws, unless others are given, which obstore finds itself.
-
-        boto3 reads them, because they may name roles and programs.
+    def _provider(config: dict[str, Any]) -> Any:
+        """Return what finds credentials, unless they are given, or in variables that obstore reads;
+        set the endpoint and the region. Credentials of ~/.aws may name roles and programs, so boto3
+        finds them.
         """
+        if address := _variable("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL"):
+            config.setdefault("endpoint", address)
         profile = config.pop("profile", None) or _variable("AWS_PROFILE")
         given = "access_key_id" in config or str(config.get("skip_signature")).lower() == "true"
         if given or (not profile and _variable("AWS_ACCESS_KEY_ID")):
-            return None
-        files = ("AWS_SHARED_CREDENTIALS_FILE", "AWS_CONFIG_FILE")
-        if not (profile or _variable(*files) or (Path.home() / ".aws").is_dir()):
             return None
         session = import_extra("boto3", "remote").Session(profile_name=profile or None)
         if session.get_credentials() is None:
@@ -160,7 +144,7 @@ class ObjectStoreClient(Client):
             answer = _library().get(store, key, options={"range": {"offset": 0}})
             data = bytes(answer.bytes())
         except Exception as error:
-            if ends_before(error):  # also for an empty object
+            if status_and_code(error)[0] == 416:  # also for an empty object
                 return b""
             raise
         if len(data) != answer.meta["size"]:
@@ -178,23 +162,19 @@ class ObjectStoreClient(Client):
             try:  # the answer to HEAD does not say whether the bucket exists
                 _library().get(store, key)
             except FileNotFoundError as error:
-                if bucket_is_missing(error):
+                if status_and_code(error)[1] == "NoSuchBucket":
                     raise
             return None
         return about["size"], f"{about['e_tag'] or ''} {about['last_modified']}"
 
-    def entries(self, url: str) -> dict[str, int | None]:
+    def entries(self, url: str) -> dict[str, bool]:
         """List a folder."""
         key = self._key(url)
         listed = _library().list_with_delimiter(self.connection[0], key)
-        names: dict[str, int | None] = {
-            f"{prefix.rstrip('/').rpartition('/')[2]}/": None
-            for prefix in listed["common_prefixes"]
-        }
-        for entry in listed["objects"]:
-            if entry["path"] != key:  # some programs store an object for the folder itself
-                names[entry["path"].rpartition("/")[2]] = entry["size"]
-        return names
+        places = dict.fromkeys(listed["common_prefixes"], True)
+        places |= dict.fromkeys([entry["path"] for entry in listed["objects"]], False)
+        places.pop(key, None)  # some programs store an object for the folder itself
+        return {place.rstrip("/").rpartition("/")[2]: folder for place, folder in places.items()}
 
     def files(self, url: str) -> dict[str, int]:
         """List all objects below a folder."""
@@ -208,7 +188,7 @@ class ObjectStoreClient(Client):
             if entry["path"] != key
         }
 
-    def put(self, url: str, data: bytes, mark: str | None = None) -> None:
+    def put(self, url: str, data: bytes, mark: str | None = None) -> bool:
         """Write an object with one request, or in parts if it is large and replaces another.
 
         If the answer to a create-only put is lost, the put is sent again and finds its own object:
@@ -217,16 +197,16 @@ class ObjectStoreClient(Client):
         library, store, key = _library(), self.connection[1], self._key(url)
         if mark is None:
             library.put(store, key, data, chunk_size=_PART_BYTES)
-            return
+            return True
         try:
             library.put(store, key, data, mode="create", attributes={_MARK: mark})
         except library.exceptions.AlreadyExistsError:
             try:
                 attributes = library.get(self.connection[0], key, options={"head": True}).attributes
             except FileNotFoundError:  # it was removed meanwhile
-                attributes = {}
-            if attributes.get(_MARK) != mark:
-                raise FileExistsError(url) from None
+                return False
+            return bool(attributes.get(_MARK) == mark)
+        return True
 
     def remove(self, urls: Iterable[str]) -> None:
         """Remove objects, in S3 1000 per request."""
@@ -246,57 +226,45 @@ def _variable(*names: str) -> str:
     return next(filter(None, map(os.environ.get, names)), "")
 
 
-class _Library:
-    """obstore in this process; in a forked process a second copy of it.
+_owners: list[int] = []  # processes with threads of obstore of their own: this one and its parents
+_locks: dict[int, threading.Lock] = {}  # by process: a lost thread may hold that of a parent
+
+
+def _library() -> ModuleType:
+    """Return obstore; in a forked process a second copy of it.
 
     Its threads (of tokio) do not survive a fork: a request in the child would wait for ever, and
     the loaders of PyTorch fork their workers. They belong to the loaded file, so that a copy of the
     file, which needs no name on Linux, has threads of its own.
+
+    Raises:
+        CarlascError: the threads were lost, on a system other than Linux.
     """
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._used = self._lost = False  # whether its threads exist, or were lost by a fork
-        self._file = ""  # the installed file, of which copies are made
-        if hasattr(os, "register_at_fork"):
-            os.register_at_fork(after_in_child=self._after_fork)
-
-    def _after_fork(self) -> None:
-        self._lock, self._lost = threading.Lock(), self._used  # a lost thread may hold the old lock
-
-    def __call__(self) -> ModuleType:
-        """Return the library.
-
-        Raises:
-            CarlascError: its threads were lost, on a system other than Linux.
-        """
-        with self._lock:
-            if self._lost:
-                self._load_copy()
-            self._used, self._lost = True, False
-            importlib.import_module("obstore.store")
-            self._file = self._file or str(sys.modules[PRIVATE].__file__)
-            return sys.modules["obstore"]
-
-    def _load_copy(self) -> None:
-        if not sys.platform.startswith("linux"):
-            raise CarlascError(
-                "a forked process",
-                problem="cannot send requests to object stores",
-                advice='start processes with the method "spawn"',
-            )
-        content = Path(self._file).read_bytes()
-        for name in [name for name in sys.modules if name.partition(".")[0] == "obstore"]:
-            del sys.modules[name]
-        with open(os.memfd_create("obstore"), "wb") as file:
-            file.write(content)
-            file.flush()
-            place = f"/proc/self/fd/{file.fileno()}"
-            loader = ExtensionFileLoader(PRIVATE, place)
-            spec = spec_from_file_location(PRIVATE, place, loader=loader)
-            module = module_from_spec(cast("ModuleSpec", spec))
-            sys.modules[PRIVATE] = module
-            loader.exec_module(module)
+    process = os.getpid()
+    with _locks.setdefault(process, threading.Lock()):
+        if process not in _owners:
+            if _owners:
+                _load_copy()
+            _owners.append(process)
+        importlib.import_module("obstore.store")
+        return sys.modules["obstore"]
 
 
-_library = _Library()
+def _load_copy() -> None:
+    if not sys.platform.startswith("linux"):
+        raise CarlascError(
+            "a forked process",
+            problem="cannot send requests to object stores",
+            advice='start processes with the method "spawn"',
+        )
+    installed = str(sys.modules[PRIVATE].__file__)
+    for name in [name for name in sys.modules if name.partition(".")[0] == "obstore"]:
+        del sys.modules[name]
+    with open(os.memfd_create("obstore"), "wb") as file:
+        file.write(Path(installed).read_bytes())
+        file.flush()
+        loader = ExtensionFileLoader(PRIVATE, f"/proc/self/fd/{file.fileno()}")
+        module = module_from_spec(ModuleSpec(PRIVATE, loader, origin=loader.path))
+        sys.modules[PRIVATE] = module
+        loader.exec_module(module)
+    module.__file__ = installed

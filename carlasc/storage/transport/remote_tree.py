@@ -6,30 +6,26 @@ import copy
 import io
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, TypeVar
 
-from carlasc.errors import CarlascError, MissingDataError, without_credentials
-from carlasc.storage.transport.clients import HUB, Client, FileSystemClient, HubClient
+from carlasc.errors import MissingDataError, without_credentials
+from carlasc.storage.transport.clients import HUB, Client, FileSystemClient
 from carlasc.storage.transport.failures import WrongAnswerError, fail
 from carlasc.storage.transport.object_stores import SCHEMES, ObjectStoreClient
 from carlasc.storage.transport.requests import send
-from carlasc.storage.transport.trees import LocalTree, Tree, check_length, is_url
-from carlasc.storage.transport.web import WebClient
+from carlasc.storage.transport.trees import LocalTree, Tree, check_length, from_start, is_url
+from carlasc.storage.transport.web import HubClient, WebClient
 
 _BLOCK = 1 << 18  # bytes per block of a remote file
 _KEPT = 64  # blocks
+_CLIENTS: Mapping[str, type[Client]] = {
+    **dict.fromkeys(SCHEMES, ObjectStoreClient),
+    **dict.fromkeys(("http", "https"), WebClient),
+    HUB: HubClient,
+}
 
 _Answer = TypeVar("_Answer")
-
-
-def _client(url: str, options: Mapping[str, Any]) -> Client:
-    scheme = url.partition("://")[0]
-    if scheme in SCHEMES:
-        return ObjectStoreClient(url, options)
-    if scheme in ("http", "https"):
-        return WebClient(url, options)
-    return (HubClient if scheme == HUB else FileSystemClient)(url, options)
 
 
 class RemoteTree(Tree):
@@ -50,14 +46,11 @@ class RemoteTree(Tree):
         """
         base, mark, query = url.partition("?") if url.startswith("http") else (url, "", "")
         # a signed URL: the signature follows each path
-        self._base, self._query = (
-            base.rstrip("/"),
-            mark + query,
-        )
+        self._base, self._query = base.rstrip("/"), mark + query
         self.location = without_credentials(self._base)
-        self.client = _client(url.rstrip("/"), options or {})
+        kind = _CLIENTS.get(url.partition("://")[0], FileSystemClient)
+        self.client = kind(url.rstrip("/"), options or {})
         self._listed: dict[str, dict[str, bool]] = {}
-        self._sizes: dict[str, int] = {}  # sizes of files in listed folders
 
     def url(self, path: str = "") -> str:
         """Return the URL of a file.
@@ -69,50 +62,52 @@ class RemoteTree(Tree):
     def below(self, folder: str) -> RemoteTree:
         """Return the tree of a folder in this one."""
         tree = copy.copy(self)
-        tree._base, tree.location = (
-            f"{place}/{folder}" if folder else place for place in (self._base, self.location)
-        )
-        tree._listed, tree._sizes = {}, {}
+        if folder:
+            tree._base, tree.location = f"{self._base}/{folder}", self.where(folder)
+        tree._listed = {}
         return tree
+
+    def ask(
+        self, function: Callable[..., _Answer], *calls: tuple[Any, ...], writing: bool = False
+    ) -> list[_Answer]:
+        """Send requests, several at a time, and return their answers.
+
+        Args:
+            function: sends one request: a method of the client that takes a URL first.
+            calls: its arguments, with a path in the place of the URL.
+            writing: whether the requests write the files (see `fail`).
+
+        Raises:
+            CarlascError: a request failed; the message names the path (see `fail`).
+        """
+        requests = [partial(function, self.url(path), *more) for path, *more in calls]
+        answers: list[_Answer] = []
+        for (path, *_), answer in zip(calls, send(requests, self.client.settings), strict=True):
+            if isinstance(answer, Exception):
+                fail(self.where(path), answer, writing=writing)
+            answers.append(answer)
+        return answers
 
     def entries(self, folder: str = "") -> Mapping[str, bool]:
         """List the folder, once."""
         if folder not in self._listed:
-            listed: dict[str, bool] = {}
-            for name, size in self._ask(folder, self.client.entries, self.url(folder)).items():
-                base = name.rstrip("/")
-                listed[base] = name != base
-                if size is not None:
-                    self._sizes[f"{folder}/{base}" if folder else base] = size
-            self._listed[folder] = listed
+            self._listed[folder] = self.ask(self.client.entries, (folder,))[0]
         return self._listed[folder]
-
-    def _ask(self, path: str, function: Callable[..., _Answer], *arguments: Any) -> _Answer:
-        """Send one request. An error names the path."""
-        (answer,) = send([partial(function, *arguments)], self.client.settings)
-        if isinstance(answer, Exception):
-            fail(self.where(path), answer)
-        return answer
 
     def refresh(self) -> None:
         """Discard cached listings, because other processes may have written files."""
-        self._listed, self._sizes = {}, {}
+        self._listed = {}
 
-    def note(self, path: str, size: int | None) -> None:
-        """Update the listing of a folder after this process wrote a file of `size` bytes, or
-        removed it (None).
-        """
-        self._sizes.pop(path, None)
-        if size is not None:
-            self._sizes[path] = size
+    def note(self, path: str, exists: bool) -> None:
+        """Update listings after this process wrote a file or removed it."""
         name, is_folder = path, False
         while name:
             folder, _, base = name.rpartition("/")
-            if folder in self._listed:
-                if size is None and not is_folder:
-                    self._listed[folder].pop(base, None)
-                elif size is not None:
-                    self._listed[folder][base] = is_folder
+            listed = self._listed.get(folder, {})
+            if exists:
+                listed[base] = is_folder
+            elif not is_folder:
+                listed.pop(base, None)
             name, is_folder = folder, True
 
     def is_file(self, path: str) -> bool:
@@ -131,82 +126,48 @@ class RemoteTree(Tree):
 
     def sizes(self, folder: str = "") -> dict[str, int]:
         """Return the sizes of all files below a folder, or of the file itself, by path."""
-        files = self._ask(folder, self.client.files, self.url(folder))
+        files = self.ask(self.client.files, (folder,))[0]
         return {"/".join(filter(None, (folder, name))): size for name, size in files.items()}
 
-    def read(self, path: str, size: int | None = None) -> bytes | memoryview:
-        """Fetch the file."""
-        return self.read_many([path])[0]
-
-    def read_range(self, path: str, start: int, end: int) -> bytes:
-        """Fetch the range."""
-        return bytes(self.read_ranges([(path, start, end)])[0])
-
     def read_many(self, paths: Sequence[str], size: int | None = None) -> list[bytes | memoryview]:
-        """Fetch the files, several at a time.
-
-        Their lengths are checked if their folder has been listed.
-        """
-        answers: dict[str, bytes | Exception] = {}
-        missing = list(paths)
-        for _ in range(2):
-            asked = [partial(self._get, path) for path in missing]
-            answers |= zip(missing, send(asked, self.client.settings), strict=True)
-            missing = [path for path in missing if isinstance(answers[path], WrongAnswerError)]
-            for path in missing:  # the files may have been replaced since the listing
-                self._sizes[path] = self._size(path)
-        return [self._data(path, answers[path]) for path in paths]
-
-    def _get(
-        self, path: str, start: int | None = None, end: int | None = None, size: int | None = None
-    ) -> bytes:
-        """Send one request, and check the length of the answer, if it is known."""
-        data = self.client.get(self.url(path), start, end)
-        expected = self._sizes.get(path) if start is None else size
-        if expected is not None and len(data) != expected:
-            raise WrongAnswerError(f"{len(data)} bytes instead of {expected}")
-        return data
-
-    def _data(self, path: str, answer: bytes | Exception) -> bytes:
-        if isinstance(answer, Exception):
-            fail(self.where(path), answer)
-        return answer
+        """Fetch the files, several at a time."""
+        return [*self.ask(self.client.get, *((path,) for path in paths))]
 
     def read_ranges(self, ranges: Sequence[tuple[str, int, int]]) -> list[bytes | memoryview]:
         """Fetch the ranges, several at a time."""
-        sizes = {
-            path: self._size(path) for path in {path for path, start, _ in ranges if start < 0}
-        }
-        wanted = [
-            (p, max(0, sizes[p] + s), sizes[p] + e) if s < 0 else (p, s, e) for p, s, e in ranges
-        ]
+        sizes = {path: self.version(path)[0] for path, start, _ in ranges if start < 0}
+        wanted = [(p, *from_start(start, end, sizes.get(p, 0))) for p, start, end in ranges]
         asked = [part for part in wanted if part[1] < part[2]]
-        answers = iter(send([partial(self._get, *part) for part in asked], self.client.settings))
-        return [self._checked(part, next(answers)) if part[1] < part[2] else b"" for part in wanted]
+        answers = iter(self.ask(self._range, *asked))
+        parts = [(part, next(answers) if part[1] < part[2] else b"") for part in wanted]
+        return [
+            check_length(data, max(0, end - start), self.where(path))
+            for (path, start, end), data in parts
+        ]
 
-    def _checked(self, part: tuple[str, int, int], answer: bytes | Exception) -> bytes:
-        """Return an answer of the right length.
+    def _range(self, url: str, start: int, end: int) -> bytes:
+        """Send the request for a range.
 
-        After a short answer the request is sent again, unless the file ends there.
+        Raises:
+            WrongAnswerError: the answer is short, although the file does not end there.
         """
-        path, start, end = part
-        data = self._data(path, answer)
-        if len(data) != end - start and self._size(path) >= end:
-            data = self._ask(path, self._get, *part, end - start)
-        return check_length(data, end - start, self.where(path))
+        data = self.client.get(url, start, end)
+        if len(data) != end - start and (about := self.client.about(url)) and about[0] >= end:
+            raise WrongAnswerError(f"{len(data)} bytes instead of {end - start}")
+        return data
 
     def open(self, path: str) -> Any:
         """Open a file as a file object, which fetches blocks on demand.
 
         For libraries that take file objects.
         """
-        return RemoteFile(partial(self.read_range, path), self._size(path))
+        return RemoteFile(partial(self.read_range, path), self.version(path)[0])
 
     def size(self, path: str = "") -> int | None:
         """Return a file's size in bytes; None if it does not exist or is a folder (or a page that
         lists one).
         """
-        about = self._ask(path, self.client.about, self.url(path))
+        about = self.ask(self.client.about, (path,))[0]
         return None if about is None else about[0]
 
     def version(self, path: str) -> tuple[int, str]:
@@ -218,35 +179,13 @@ class RemoteTree(Tree):
         Raises:
             MissingDataError: the file does not exist.
         """
-        about = self._ask(path, self.client.about, self.url(path))
+        about = self.ask(self.client.about, (path,))[0]
         if about is None:
             raise MissingDataError(self.where(path), expected="a file", found="nothing")
         return about
 
-    def _size(self, path: str) -> int:
-        return self.version(path)[0]
-
-    def check_ranges(self, path: str = "") -> None:
-        """Request one byte to check for range requests: without them, each read would transfer the
-        whole file.
-
-        Raises:
-            CarlascError: the server does not support range requests.
-        """
-        if not self._base.startswith("http"):
-            return
-        (answer,) = send([partial(self._get, path, 0, 1)], self.client.settings, attempts=2)
-        if isinstance(answer, WrongAnswerError):
-            raise CarlascError(
-                self.where(path),
-                expected="a server that supports range requests",
-                found="a server without them",
-                advice="download the file first",
-            )
-        self._data(path, answer)
-
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_listed": {}, "_sizes": {}}  # a worker process lists folders again
+        return self.__dict__ | {"_listed": {}}  # a worker process lists folders again
 
 
 def tree_of(
@@ -270,16 +209,20 @@ def tree_of(
 class RemoteFile(io.RawIOBase):
     """A remote file as a file object, for libraries that read one: h5py and pyarrow.
 
-    It reads the file block by block, and caches the most recently used blocks.
+    It reads the file block by block, and caches the most recently used blocks. What is longer than
+    a block is read with one request.
     """
 
-    def __init__(self, fetch: Callable[[int, int], bytes], size: int) -> None:
+    def __init__(self, fetch: Callable[[int, int], bytes | memoryview], size: int) -> None:
         """Create a file of `size` bytes.
 
         `fetch` returns the bytes [start, end). Nothing is fetched yet.
         """
         self._fetch, self._size, self._place = fetch, size, 0
-        self._blocks: dict[int, bytes] = {}  # ordered by last use, the latest at the end
+        self._block = lru_cache(_KEPT)(self._fetch_block)
+
+    def _fetch_block(self, number: int) -> bytes | memoryview:
+        return self._fetch(number * _BLOCK, min((number + 1) * _BLOCK, self._size))
 
     def readable(self) -> bool:
         """Return True."""
@@ -296,42 +239,18 @@ class RemoteFile(io.RawIOBase):
         )
         return self._place
 
-    def tell(self) -> int:
-        """Return the position in the file."""
-        return self._place
-
     def readinto(self, buffer: bytearray | memoryview) -> int:  # type: ignore[override]
         """Read bytes into a buffer, and return their number."""
         view = memoryview(buffer).cast("B")
         start, end = self._place, min(self._place + len(view), self._size)
         if start >= end:
             return 0
-        first, last = start // _BLOCK, (end - 1) // _BLOCK
-        self._load(first, last)
-        data = b"".join(self._blocks[number] for number in range(first, last + 1))
-        view[: end - start] = data[start - first * _BLOCK : end - first * _BLOCK]
+        if end - start > _BLOCK:
+            data = self._fetch(start, end)
+        else:
+            first, last = start // _BLOCK, (end - 1) // _BLOCK
+            blocks = b"".join(map(self._block, range(first, last + 1)))
+            data = blocks[start - first * _BLOCK : end - first * _BLOCK]
+        view[: end - start] = data
         self._place = end
-        for number in range(first, last + 1):
-            self._blocks[number] = self._blocks.pop(number)
-        while len(self._blocks) > _KEPT:
-            del self._blocks[next(iter(self._blocks))]
         return end - start
-
-    def _load(self, first: int, last: int) -> None:
-        """Fetch the blocks from `first` to `last` that are not cached.
-
-        Adjacent blocks are fetched in one request.
-        """
-        number = first
-        while number <= last:
-            if number in self._blocks:
-                number += 1
-                continue
-            stop = number + 1
-            while stop <= last and stop not in self._blocks:
-                stop += 1
-            data = self._fetch(number * _BLOCK, min(stop * _BLOCK, self._size))
-            for place in range(number, stop):
-                offset = (place - number) * _BLOCK
-                self._blocks[place] = data[offset : offset + _BLOCK]
-            number = stop

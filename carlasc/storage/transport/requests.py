@@ -12,7 +12,6 @@ import dataclasses
 import os
 import random
 import threading
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -78,48 +77,33 @@ class RemoteSettings:
 
 
 def send(
-    requests: Sequence[Callable[[], _Answer]],
-    settings: RemoteSettings,
-    attempts: int | None = None,
+    requests: Sequence[Callable[[], _Answer]], settings: RemoteSettings
 ) -> list[_Answer | Exception]:
-    """Call functions that each send a request, several at a time; again after temporary failures.
+    """Call functions that each send a request, several at a time, each as `persist` does.
 
     Args:
         requests: the functions; several threads call them.
         settings: how many at a time, and how often.
-        attempts: number of attempts, if it is not that of the settings.
 
     Returns:
         One answer per request, in their order, or the exception of a failed request.
     """
-    answers: list[Any] = [None] * len(requests)
-    waiting = list(range(len(requests)))
-    for attempt in range(attempts or settings.attempts):
-        if not waiting:
-            break
-        if attempt:
-            time.sleep(settings.draw_wait_s(attempt))
-        if len(waiting) == 1:
-            answered = [_call(requests[waiting[0]])]
-        else:
-            threads = ThreadPoolExecutor(min(settings.requests, len(waiting)))
-            try:
-                answered = list(threads.map(_call, [requests[i] for i in waiting]))
-            finally:
-                threads.shutdown(cancel_futures=True)  # after Ctrl-C, no further request is sent
-        for place, answer in zip(waiting, answered, strict=True):
-            answers[place] = answer
-        waiting = [
-            i for i in waiting if isinstance(answers[i], Exception) and is_temporary(answers[i])
-        ]
-    return answers
+    stop = threading.Event()
 
+    def call(request: Callable[[], _Answer]) -> _Answer | Exception:
+        try:
+            return persist(request, settings, stop=stop)
+        except Exception as error:  # noqa: BLE001 (each library raises its own types)
+            return error
 
-def _call(request: Callable[[], _Answer]) -> _Answer | Exception:
+    if len(requests) < 2:
+        return [call(request) for request in requests]
+    threads = ThreadPoolExecutor(min(settings.requests, len(requests)))
     try:
-        return request()
-    except Exception as error:  # noqa: BLE001 (each library raises its own types)
-        return error
+        return list(threads.map(call, requests))
+    finally:
+        stop.set()  # after Ctrl-C, no further request is sent
+        threads.shutdown(cancel_futures=True)
 
 
 def persist(
@@ -128,7 +112,7 @@ def persist(
     count: Callable[[], int] = lambda: 0,
     stop: threading.Event | None = None,
 ) -> _Answer:
-    """Call a function that sends a request, again after temporary failures, as `send` does.
+    """Call a function that sends a request, again after temporary failures.
 
     Args:
         work: the function.

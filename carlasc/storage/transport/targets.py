@@ -10,17 +10,13 @@ import os
 import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.running.spreading import Run
 from carlasc.storage.files import leads_outside, write_atomic, write_many
-from carlasc.storage.transport.clients import HUB
-from carlasc.storage.transport.failures import fail
 from carlasc.storage.transport.remote_tree import RemoteTree
-from carlasc.storage.transport.requests import send
 from carlasc.storage.transport.trees import LocalTree, Tree, is_url
 
 _MOST_REMOVED = 1000  # objects in one request: the limit of S3
@@ -72,14 +68,12 @@ class Target(ABC):
             StorageError: the file cannot be written; no temporary file remains.
         """
 
+    @abstractmethod
     def put_many(self, *groups: Mapping[str, bytes | memoryview]) -> None:
         """Write several groups of files, one group after the other.
 
         Files of a group are written in parallel.
         """
-        for group in groups:
-            for path, data in group.items():
-                self.put(path, data)
 
     @abstractmethod
     def paths(self, folder: str = "") -> Iterator[str]:
@@ -95,6 +89,13 @@ class Target(ABC):
         """Remove several files, if they exist. Object stores need few requests for this."""
         for path in paths:
             self.remove(path)
+
+    def _checked(self, path: str) -> str:
+        if leads_outside(path):
+            raise FormatError(
+                path, expected=f"a path inside {self.location}", found="a path that leads out of it"
+            )
+        return path
 
 
 class LocalTarget(Target):
@@ -121,7 +122,7 @@ class LocalTarget(Target):
 
     def paths(self, folder: str = "") -> Iterator[str]:
         """Yield the paths of all files, without temporary files of writers."""
-        for root, _, names in os.walk(self._inside(folder) if folder else self.folder):
+        for root, _, names in os.walk(self._inside(folder)):
             for name in names:
                 if not name.startswith("."):
                     yield (Path(root) / name).relative_to(self.folder).as_posix()
@@ -135,11 +136,7 @@ class LocalTarget(Target):
             place.unlink(missing_ok=True)
 
     def _inside(self, path: str) -> Path:
-        if leads_outside(path):
-            raise FormatError(
-                path, expected=f"a path inside {self.folder}", found="a path that leads out of it"
-            )
-        return self.folder / path
+        return self.folder / self._checked(path)
 
 
 class RemoteTarget(Target):
@@ -165,10 +162,7 @@ class RemoteTarget(Target):
         """
         self.tree = RemoteTree(url, options)
         self.location = self.tree.location
-        readable = {"http": "a web server, which can only be read"}
-        readable["https"] = readable["http"]
-        readable[HUB] = "the Hugging Face Hub, where each file would be a commit"
-        if found := readable.get(self.tree.client.scheme):
+        if found := self.tree.client.read_only:
             raise ArgumentError(
                 self.location,
                 expected="a folder, or a URL of an object store",
@@ -186,17 +180,19 @@ class RemoteTarget(Target):
 
     def put(self, path: str, data: bytes | memoryview, *, create: bool = False) -> bool:
         """Write an object with one request."""
-        mark = os.urandom(16).hex() if create else None
-        try:
-            self._put({path: data}, mark)
-        except FileExistsError:
-            return False
-        return True
+        return all(self._put({path: data}, os.urandom(16).hex() if create else None))
 
     def put_many(self, *groups: Mapping[str, bytes | memoryview]) -> None:
         """Write the objects of each group in parallel."""
         for group in groups:
             self._put(group)
+
+    def _put(self, files: Mapping[str, bytes | memoryview], mark: str | None = None) -> list[bool]:
+        puts = [(self._checked(path), bytes(data), mark) for path, data in files.items()]
+        written = self.tree.ask(self.tree.client.put, *puts, writing=True)
+        for path in files:
+            self.tree.note(path, True)
+        return written
 
     def paths(self, folder: str = "") -> Iterator[str]:
         """List all objects below the folder, 1000 per request."""
@@ -209,34 +205,11 @@ class RemoteTarget(Target):
     def remove_many(self, paths: Iterable[str]) -> None:
         """Remove objects, in S3 1000 per request. Missing objects are ignored."""
         names = [self._checked(path) for path in paths]
-        client, urls = self.tree.client, [self.tree.url(name) for name in names]
-        batches = [urls[i : i + _MOST_REMOVED] for i in range(0, len(urls), _MOST_REMOVED)]
-        for answer in send([partial(client.remove, batch) for batch in batches], client.settings):
-            if isinstance(answer, Exception):
-                fail(self.location, answer, writing=True)
+        urls = [self.tree.url(name) for name in names]
+        batches = [("", urls[i : i + _MOST_REMOVED]) for i in range(0, len(urls), _MOST_REMOVED)]
+        self.tree.ask(lambda _, batch: self.tree.client.remove(batch), *batches, writing=True)
         for name in names:
-            self.tree.note(name, None)
-
-    def _put(self, files: Mapping[str, bytes | memoryview], mark: str | None = None) -> None:
-        client = self.tree.client
-        puts = [
-            partial(client.put, self.tree.url(self._checked(path)), bytes(data), mark)
-            for path, data in files.items()
-        ]
-        for path, answer in zip(files, send(puts, client.settings), strict=True):
-            if isinstance(answer, FileExistsError):
-                raise answer
-            if isinstance(answer, Exception):
-                fail(self.tree.where(path), answer, writing=True)
-        for path, data in files.items():
-            self.tree.note(path, len(data))
-
-    def _checked(self, path: str) -> str:
-        if leads_outside(path):
-            raise FormatError(
-                path, expected=f"a path inside {self.location}", found="a path that leads out of it"
-            )
-        return path
+            self.tree.note(name, False)
 
 
 def target_of(out: str | os.PathLike[str] | Target, **storage_options: Any) -> Target:

@@ -12,17 +12,21 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
 from carlasc.errors import CarlascError, FormatError, MissingDataError
 
-# Minimum size of mapped ranges. Reading the megabyte of a scan is faster than mapping its pages.
-_MAPPED = 1 << 22
 # Opening a pipe would hang without a writer; Windows would change the ends of lines.
 _READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+
+_Data = TypeVar("_Data", bound=bytes | memoryview)
 
 
 class Tree(ABC):
     """A folder of files. Paths in it are relative, with "/" between parts; "" is the folder itself.
+
+    A kind of tree has `read` or `read_many`, and `read_range` or `read_ranges`; each of them calls
+    the other.
 
     Attributes:
         location: its name in errors: a folder, a zip, a URL.
@@ -36,7 +40,6 @@ class Tree(ABC):
         does not exist.
         """
 
-    @abstractmethod
     def read(self, path: str, size: int | None = None) -> bytes | memoryview:
         """Return a file's bytes.
 
@@ -49,8 +52,8 @@ class Tree(ABC):
             MissingDataError: the file does not exist.
             FormatError: the file cannot be read, or is damaged.
         """
+        return self.read_many([path], size)[0]
 
-    @abstractmethod
     def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
         """Return the bytes [start, end) of a file.
 
@@ -60,6 +63,7 @@ class Tree(ABC):
             MissingDataError: the file does not exist.
             FormatError: the file is shorter.
         """
+        return self.read_ranges([(path, start, end)])[0]
 
     def is_file(self, path: str) -> bool:
         """Whether a file exists."""
@@ -130,17 +134,13 @@ class LocalTree(Tree):
             return memoryview(mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ))
 
     def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
-        """Read the range, or map it into memory if it is large."""
+        """Read the range."""
         with self._opened(path) as descriptor:
             size = os.fstat(descriptor).st_size
-            if start < 0:
-                start, end = max(0, size + start), size + end
-            if end > size:  # the range may come from a damaged table, and be larger than the memory
-                raise _shorter(end - start, max(0, size - start), self.where(path))
-            if end - start >= _MAPPED:
-                return _map_range(descriptor, start, end)
-            os.lseek(descriptor, start, os.SEEK_SET)
-            data = os.read(descriptor, end - start)
+            start, end = from_start(start, end, size)
+            os.lseek(descriptor, min(start, size), os.SEEK_SET)
+            # the range may come from a damaged table, and be larger than the memory
+            data = os.read(descriptor, max(0, min(end, size) - start))
         return check_length(data, end - start, self.where(path))
 
     @contextmanager
@@ -160,20 +160,12 @@ class LocalTree(Tree):
             raise FormatError(path, problem=f"cannot be read: {error.strerror or error}") from error
 
 
-def _map_range(descriptor: int, start: int, end: int) -> memoryview:
-    """Map the bytes [start, end) of an open file into memory. The file must be long enough."""
-    skipped = start % mmap.ALLOCATIONGRANULARITY
-    length, offset = end - start + skipped, start - skipped
-    if os.name == "nt":
-        mapped = mmap.mmap(descriptor, length, access=mmap.ACCESS_READ, offset=offset)
-    else:
-        # read all pages at once (Linux only)
-        flags = mmap.MAP_SHARED | getattr(mmap, "MAP_POPULATE", 0)
-        mapped = mmap.mmap(descriptor, length, flags, mmap.PROT_READ, offset=offset)
-    return memoryview(mapped)[skipped:]
+def from_start(start: int, end: int, size: int) -> tuple[int, int]:
+    """Return a range counted from the start of a file of `size` bytes (see `Tree.read_range`)."""
+    return (max(0, size + start), size + end) if start < 0 else (start, end)
 
 
-def check_length(data: bytes, expected: int, where: str) -> bytes:
+def check_length(data: _Data, expected: int, where: str) -> _Data:
     """Return `data` if it has the expected length.
 
     Args:
@@ -185,17 +177,13 @@ def check_length(data: bytes, expected: int, where: str) -> bytes:
         FormatError: the length is different: the file is truncated, or a server sent another range.
     """
     if len(data) != expected:
-        raise _shorter(expected, len(data), where)
+        raise FormatError(
+            where,
+            expected=f"{expected} bytes in this range",
+            found=str(len(data)),
+            advice="the file may be truncated",
+        )
     return data
-
-
-def _shorter(expected: int, found: int, where: str) -> FormatError:
-    return FormatError(
-        where,
-        expected=f"{expected} bytes in this range",
-        found=str(found),
-        advice="the file may be truncated",
-    )
 
 
 def is_url(place: object) -> bool:

@@ -1,267 +1,217 @@
-"""The client of web servers: aiohttp, through the file system of fsspec."""
+"""The clients of web servers, through urllib3, and of the Hugging Face Hub.
+
+Requests are sent in the thread that needs the answer, redirections are followed here.
+"""
 
 from __future__ import annotations
 
-import gc
-import threading
+import re
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cache, partial
+from html import unescape
 from typing import Any
+from urllib.parse import unquote, urljoin, urlsplit
 
-from carlasc.errors import CarlascError, import_extra, without_credentials
-from carlasc.storage.transport.clients import FileSystemClient, check_range
-from carlasc.storage.transport.failures import WrongAnswerError
+from carlasc.errors import ArgumentError, CarlascError, import_extra, without_credentials
+from carlasc.storage.transport.clients import Client, FileSystemClient
+from carlasc.storage.transport.failures import StatusError, WholeFileError, WrongAnswerError
+
+PARTIAL = 206
+"""The status of an answer to a request for a range."""
 
 _PIECE = 256 << 10  # bytes per piece of a body
 _MOST_BYTES = 1 << 30  # limit for files that are read whole; larger files are read in ranges
 _MOST_OF_PAGE = 1 << 26  # maximum bytes of a page that lists a folder
 _SLOWEST = 1000  # bytes per second
-_LONGEST_PIECE_S = 0.5  # maximum time to collect the bytes of one piece
+_REDIRECTIONS = 10
+_LINK = re.compile(r"""<a\s[^>]*?href=["']([^"']+)""", re.IGNORECASE)
 
 
-@dataclass(frozen=True)
-class HttpAnswer:
-    """The answer of a web server.
+class WebClient(Client):
+    """The client of a web server, which can only be read.
 
-    Attributes:
-        status: HTTP status.
-        reason: reason phrase of the status.
-        headers: headers; names are case-insensitive.
-        first: the first bytes of the body.
-        more: returns the next bytes; empty at the end of the body.
-        error: error of aiohttp if the status is 400 or more.
+    Its only storage option is `headers`, the headers of each request.
     """
 
-    status: int
-    reason: str
-    headers: Mapping[str, str]
-    first: bytes
-    more: Callable[[], bytes]
-    error: Exception | None
-
-    def pieces(self) -> Iterator[bytes]:
-        """Yield the body."""
-        piece = self.first
-        while piece:
-            yield piece
-            piece = self.more()
-
-
-class WebClient(FileSystemClient):
-    """The client of a web server."""
+    read_only = "a web server, which can only be read"
 
     def __init__(self, url: str, options: Mapping[str, Any]) -> None:
         super().__init__(url, options)
-        import_extra("aiohttp", "remote")
+        parse_url = import_extra("urllib3", "remote").util.parse_url
+        for name in self.options.keys() - {"headers"}:
+            raise ArgumentError(
+                name, expected="`headers`, the storage option of web servers", found="another one"
+            )
+        self._login = unquote(parse_url(url).auth or "")
 
-    def open(self, **more: Any) -> Any:
-        """Return the file system, with limits for silent servers and endless pages."""
-        from aiohttp import ClientTimeout
-
-        timeout = self.settings.timeout_s
-        silence = ClientTimeout(total=None, sock_connect=timeout, sock_read=timeout)
-        limits = {"timeout": silence, "response_class": _bounded_response(timeout)}
-        limits |= self.options.get("client_kwargs", {})
-        return super().open(client_kwargs=limits)
-
-    def get(self, url: str, start: int | None = None, end: int | None = None) -> bytes:
-        """Return bytes of a file with one request."""
-        from fsspec.asyn import sync
-
-        fs = self.connection
-        return bytes(sync(fs.loop, get, fs, url, self.settings.timeout_s, start, end))
-
-    def entries(self, url: str) -> dict[str, int | None]:
-        """List a folder, from the links in its page."""
-        return super().entries(url if "?" in url else f"{url}/")
-
-    def _own_name(self, url: str) -> str:
-        return url.strip("/")
+    def open(self) -> Any:
+        """Return the pool of connections."""
+        urllib3 = import_extra("urllib3", "remote")
+        return urllib3.PoolManager(maxsize=self.settings.requests, timeout=self.settings.timeout_s)
 
     @contextmanager
-    def answer(self, headers: Mapping[str, str]) -> Iterator[HttpAnswer]:
-        """Send one request for the file, and yield its answer. Its body can be read in pieces.
-
-        Args:
-            headers: headers of the request.
+    def answer(self, url: str, headers: Mapping[str, str], method: str = "GET") -> Iterator[Any]:
+        """Send one request, follow redirections, and yield the answer of urllib3, with any status.
+        Its body is not read yet.
 
         Raises:
             CarlascError: the request was redirected in a loop, to a URL that is not http(s), or
                 from https to http.
-            Exception: the server cannot be reached (an error of aiohttp).
+            Exception: the server cannot be reached (an error of urllib3).
         """
-        from fsspec.asyn import sync
-
-        fs, answer = self.connection, None
-
-        async def begin() -> tuple[Any, bytes, Exception | None]:
-            answer = await _answer(fs, self.url, {"Accept-Encoding": "identity", **headers})
-            error = None
+        sent = {**self.options.get("headers", {}), **headers}
+        if self._login:
+            make_headers = import_extra("urllib3", "remote").make_headers
+            sent |= make_headers(basic_auth=self._login)
+        place = url
+        for _ in range(_REDIRECTIONS):
+            answer = self.connection.request(
+                method, place, headers=sent, retries=False, redirect=False, preload_content=False
+            )
             try:
-                first = await _read_piece(answer.content, _PIECE)
-                answer.raise_for_status()
-            except BaseException as failure:
-                if answer.status < 400 or not isinstance(failure, Exception):
-                    answer.close()
-                    raise
-                error = failure
-            return answer, first, error
+                target = answer.get_redirect_location()
+                if not target:
+                    yield answer
+                    return
+            finally:
+                answer.close()
+            before, place = urlsplit(place), urljoin(place, target)
+            after = urlsplit(place)
+            if after.scheme not in (before.scheme, "https"):
+                break
+            if after.netloc != before.netloc:  # credentials are for the first server alone
+                sent = {name: sent[name] for name in sent if name.lower() in ("range", "if-range")}
+        raise CarlascError(
+            without_credentials(url),
+            expected="a file",
+            found="a redirection in a loop, to another scheme, or from https to http",
+            advice="check the URL",
+        )
 
+    def pieces(self, answer: Any) -> Iterator[bytes]:
+        """Yield the body of an answer as it arrives.
+
+        Raises:
+            TimeoutError: for the time without data that the settings allow, less than a kilobyte
+                per second has arrived.
+            Exception: the connection broke (an error of urllib3).
+        """
+        count, began = 0, time.monotonic()
+        while piece := answer.read1(_PIECE, decode_content=False):
+            yield piece
+            count, elapsed_s = count + len(piece), time.monotonic() - began
+            if elapsed_s > self.settings.timeout_s and count < _SLOWEST * elapsed_s:
+                raise TimeoutError(f"{count} bytes in {elapsed_s:.0f} s")
+
+    def get(
+        self,
+        url: str,
+        start: int | None = None,
+        end: int | None = None,
+        headers: Mapping[str, str] | None = None,
+        most: int = _MOST_BYTES,
+    ) -> bytes:
+        """Return bytes of a file with one request.
+
+        A server may send more than it announced, even an endless body: more than `most` bytes of a
+        whole file are refused.
+        """
+        wanted = dict(headers or {})
+        if start is not None and end is not None:
+            most, wanted["Range"] = end - start, f"bytes={start}-{end - 1}"
+        with self.answer(url, wanted) as answer:
+            if answer.status == 416:  # the range starts after the end of the file
+                return b""
+            if answer.status == 404:
+                raise FileNotFoundError(url)
+            if answer.status >= 300:
+                raise StatusError(answer.status)
+            if start is not None and end is not None:
+                if answer.status != PARTIAL:
+                    raise WholeFileError("the whole file instead of a range")
+                check_range(answer.headers.get("Content-Range"), start, end)
+            data = bytearray()
+            for piece in self.pieces(answer):
+                data += piece
+                if len(data) > most:
+                    raise WrongAnswerError(f"more than {most} bytes")
+        return bytes(data)
+
+    def about(self, url: str) -> tuple[int, str] | None:
+        """Describe a file, from the headers of an answer. Some servers refuse HEAD."""
+        for method in ("HEAD", "GET"):
+            with self.answer(url, {}, method) as answer:
+                headers, status = answer.headers, answer.status
+            if status == 404:
+                return None
+            if status < 300:
+                if headers.get("Content-Type", "").startswith("text/html"):
+                    return None
+                if (size := headers.get("Content-Length", "")).isdecimal():
+                    return int(size), headers.get("ETag") or headers.get("Last-Modified", "")
+        raise StatusError(status) if status >= 300 else WrongAnswerError("no length")
+
+    def entries(self, url: str) -> dict[str, bool]:
+        """List a folder, from the links in its page."""
+        folder = f"{url.partition('?')[0].rstrip('/')}/"
         try:
-            answer, first, error = sync(fs.loop, begin)
-            more = partial(sync, fs.loop, _read_piece, answer.content, _PIECE)
-            yield HttpAnswer(answer.status, answer.reason or "", answer.headers, first, more, error)
-        finally:
-            if answer is not None:
-                fs.loop.call_soon_threadsafe(answer.close)
+            page = self.get(url if "?" in url else folder, most=_MOST_OF_PAGE)
+        except FileNotFoundError:
+            return {}
+        names = {}
+        for link in _LINK.findall(page.decode(errors="replace")):
+            place = re.split("[?#]", urljoin(folder, unescape(link)))[0]
+            name, slash, more = place.removeprefix(folder).partition("/")
+            if place.startswith(folder) and name and not more:
+                names[unquote(name)] = bool(slash)
+        return names
+
+    def files(self, url: str) -> dict[str, int]:
+        """List all files below a folder."""
+        if (about := self.about(url)) is not None:
+            return {"": about[0]}
+        return {
+            f"{name}/{path}".rstrip("/"): size
+            for name in self.entries(url)
+            for path, size in self.files(f"{url}/{name}").items()
+        }
 
 
-async def get(fs: Any, url: str, patience_s: float, start: int | None, end: int | None) -> bytes:
-    """Return the bytes [start, end) of a file, or the whole file.
+class HubClient(FileSystemClient):
+    """The client of the Hugging Face Hub.
+
+    The library lists files. Bytes are fetched here, because it repeats requests by its own rules,
+    and does not compare the range that it receives with the one that it requested.
+    """
+
+    read_only = "the Hugging Face Hub, where each file would be a commit"
+
+    def __init__(self, url: str, options: Mapping[str, Any]) -> None:
+        super().__init__(url, options)
+        import_extra("huggingface_hub", "hub")
+        self._web = WebClient("https://huggingface.co", {})
+
+    def get(self, url: str, start: int | None = None, end: int | None = None) -> bytes:
+        """Return bytes of a file with one request."""
+        hub = import_extra("huggingface_hub.utils", "hub")
+        headers = hub.build_hf_headers(token=self.connection.token)
+        return self._web.get(self.connection.url(url), start, end, headers)
+
+
+def check_range(header: str | None, start: int, end: int) -> None:
+    """Compare the header Content-Range, "bytes 0-99/1000", with the requested range.
+
+    The file may end before the range does.
 
     Args:
-        fs: the file system of fsspec.
-        url: URL of the file.
-        patience_s: maximum time during which the server may send less than a kilobyte per second.
-        start: first byte; None for the whole file.
-        end: end of the range, exclusive; None for the whole file.
+        header: the header; None if the server sent none.
+        start: first requested byte.
+        end: end of the requested range, exclusive.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        WrongAnswerError: the answer does not fit the request.
-        aiohttp.ClientError: the request failed.
+        WrongAnswerError: the header has another range.
     """
-    wanted = {} if start is None or end is None else {"Range": f"bytes={start}-{end - 1}"}
-    async with await _answer(fs, url, wanted) as answer:
-        if answer.status == 416:
-            return b""
-        if answer.status == 404:
-            raise FileNotFoundError(url)
-        answer.raise_for_status()
-        if start is not None and answer.status != 206:
-            raise WrongAnswerError("the whole file instead of a range")
-        most = _MOST_BYTES if start is None or end is None else end - start
-        data = await _read_body(answer.content, most, patience_s)
-    if start is not None:
-        check_range(answer.headers.get("Content-Range"), start, end)
-    return data
-
-
-async def _answer(fs: Any, url: str, headers: Mapping[str, str]) -> Any:
-    """Send a request, with `headers` and those of the file system, and return the answer of
-    aiohttp. The body is not read yet.
-    """
-    session = await fs.set_session()
-    settings = dict(fs.kwargs)
-    together = {**settings.pop("headers", {}), **headers}
-    nowhere = CarlascError(
-        without_credentials(url),
-        expected="a file",
-        found="a redirection in a loop, to another scheme, or from https to http",
-        advice="check the URL",
-    )
-    try:
-        answer = await session.get(fs.encode_url(url), headers=together, **settings)
-    except Exception as error:
-        # Since 3.10, aiohttp has a separate error for other schemes.
-        if "Redirect" in type(error).__name__ or type(error) is ValueError:
-            raise nowhere from None
-        raise
-    schemes = [step.url.scheme for step in answer.history] + [answer.url.scheme]
-    if "https" in schemes and "http" in schemes[schemes.index("https") :]:
-        answer.close()
-        raise nowhere
-    return answer
-
-
-async def _read_piece(content: Any, most: int) -> bytes:
-    """Return the next bytes of a body: at most `most`, fewer if they arrive slowly, empty at the
-    end.
-
-    When a connection breaks, aiohttp drops received bytes. This function returns them, and the next
-    call raises the error.
-    """
-    data, began = bytearray(), time.monotonic()
-    try:
-        while len(data) < most and time.monotonic() - began < _LONGEST_PIECE_S:
-            if not (more := await content.read(most - len(data))):
-                break
-            data += more
-    except Exception:
-        if not data:
-            raise
-    return bytes(data)
-
-
-@cache
-def _bounded_response(patience_s: float) -> Any:
-    """Return a subclass of the response of aiohttp that limits the size and time of bodies. fsspec
-    reads listings with it.
-    """
-    from aiohttp import ClientResponse
-
-    class BoundedResponse(ClientResponse):
-        async def read(self) -> bytes:
-            return await _read_body(self.content, _MOST_OF_PAGE, patience_s)
-
-        async def text(self, encoding: str | None = None, errors: str = "strict") -> str:
-            return (await self.read()).decode(encoding or self.charset or "utf-8", errors)
-
-    return BoundedResponse
-
-
-async def _read_body(content: Any, most: int, patience_s: float) -> bytes:
-    """Read a body of at most `most` bytes.
-
-    A server may send more than it announced, even an endless body.
-
-    Raises:
-        WrongAnswerError: the body has more bytes.
-        TimeoutError: after `patience_s`, less than a kilobyte per second has arrived.
-    """
-    data, began = bytearray(), time.monotonic()
-    async for piece in content.iter_any():
-        data += piece
-        if len(data) > most:
-            raise WrongAnswerError(f"more than {most} bytes")
-        elapsed_s = time.monotonic() - began
-        if elapsed_s > patience_s and len(data) < _SLOWEST * elapsed_s:
-            raise TimeoutError(f"{len(data)} bytes in {elapsed_s:.0f} s")
-    return bytes(data)
-
-
-_pauses_lock = threading.Lock()
-_pauses = 0  # blocks of `garbage_collection_paused` that run, in all threads
-_was_enabled = False  # whether garbage collection was on before the first of them
-
-
-@contextmanager
-def garbage_collection_paused() -> Iterator[None]:
-    """Turn garbage collection off while a library with a global lock, such as h5py, reads a file
-    object with requests.
-
-    Garbage collection on the thread of fsspec could free an object of that library, which needs the
-    same lock: a deadlock. Before the block starts, a collection in progress on that thread is
-    finished.
-    """
-    global _pauses, _was_enabled  # noqa: PLW0603 (garbage collection is one for all threads)
-    import asyncio
-
-    from fsspec.asyn import get_loop, sync
-
-    with _pauses_lock:
-        _was_enabled = gc.isenabled() if _pauses == 0 else _was_enabled
-        _pauses += 1
-        gc.disable()
-    try:
-        # after this, no collection is in progress on that thread
-        sync(get_loop(), asyncio.sleep, 0)
-        yield
-    finally:
-        with _pauses_lock:
-            _pauses -= 1
-            if _pauses == 0 and _was_enabled:
-                gc.enable()
+    found = re.fullmatch(r"bytes (\d+)-(\d+)/.*", header or f"bytes {start}-{start}/*")
+    if found is None or int(found[1]) != start or int(found[2]) >= end:
+        raise WrongAnswerError("another range of the file")

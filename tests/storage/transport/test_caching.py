@@ -34,7 +34,7 @@ from carlasc.testing.data import WHOLE
 
 pytestmark = pytest.mark.posix("fork, and limits of the size of files")
 
-pytest.importorskip("aiohttp")
+pytest.importorskip("urllib3")
 
 SIZE = 10 * PIECE
 SPAWN = multiprocessing.get_context("spawn")

@@ -22,12 +22,12 @@ import carlasc
 from carlasc.errors import CarlascError, DependencyError, FormatError, MissingDataError
 from carlasc.storage import Source, layout
 from carlasc.storage.packing import pack
-from carlasc.storage.transport import web
 from carlasc.storage.transport.targets import RemoteTarget
+from carlasc.storage.transport.web import WebClient
 from carlasc.testing import SourceContract
 from carlasc.testing.data import WHOLE
 
-for package in ("aiohttp", "zarr", "h5py", "hdf5plugin", "pyarrow"):
+for package in ("urllib3", "zarr", "h5py", "hdf5plugin", "pyarrow"):
     pytest.importorskip(package)
 
 
@@ -185,14 +185,14 @@ def test_garbage_that_h5py_must_free_does_not_stop_the_thread_that_h5py_waits_fo
     pack(published, folder / "garbage.h5")
     ready, made = [h5py.h5t.NATIVE_DOUBLE.copy() for _ in range(200)], []
 
-    get = web.get
+    get = WebClient.get
 
-    async def get_and_leave_garbage(*arguments: Any, **options: Any) -> Any:
+    def get_and_leave_garbage(*arguments: Any, **options: Any) -> bytes:
         _Cell(ready.pop())
         made[:] = [[] for _ in range(10_000)]  # so many new objects start a collection, if any may
-        return await get(*arguments, **options)
+        return get(*arguments, **options)
 
-    monkeypatch.setattr(web, "get", get_and_leave_garbage)
+    monkeypatch.setattr(WebClient, "get", get_and_leave_garbage)
     source = carlasc.open(f"{url}/garbage.h5")
     assert source.sequences()[WHOLE].fields() == carlasc.open(published).sequences()[WHOLE].fields()
     assert made and gc.isenabled()
@@ -336,7 +336,7 @@ def test_a_corrupted_remote_chunk_names_field_and_frame(published: Path, tmp_pat
 @pytest.mark.parametrize(
     ("module", "make", "extra"),
     [
-        ("aiohttp", lambda _: "http://127.0.0.1:9/x.zip", "remote"),
+        ("urllib3", lambda _: "http://127.0.0.1:9/x.zip", "remote"),
         ("obstore", lambda _: "s3://bucket/x.zip", "remote"),
         ("numcodecs", lambda folder: folder / "x.zarr", "zarr"),
         ("google_crc32c", lambda folder: folder / "x.zarr", "zarr"),

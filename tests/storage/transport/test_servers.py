@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from carlasc.storage.transport.clients import check_range
 from carlasc.storage.transport.failures import TEMPORARY, WrongAnswerError
 from carlasc.storage.transport.object_stores import PRIVATE
+from carlasc.storage.transport.web import check_range
 
 
 def installed(module: str) -> str:

@@ -29,7 +29,7 @@ Answer = Callable[[BaseHTTPRequestHandler], None]
 def cases() -> Iterator[Case]:
     """Yield the cases."""
     yield from _downloads()
-    if find_spec("aiohttp"):
+    if find_spec("urllib3"):
         yield from _remote()
 
 
