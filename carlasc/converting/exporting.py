@@ -19,8 +19,8 @@ from carlasc.converting.exporter import (
     SequenceExporter,
     SequenceFile,
 )
+from carlasc.converting.protocol import Failure, check_outside
 from carlasc.converting.registry import load_exporter, read_options
-from carlasc.converting.results import ExportResult, Failure, check_outside
 from carlasc.core.arrays import AnyArray
 from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError, StorageError
 from carlasc.running.processes import one_pool, run_all
@@ -39,6 +39,30 @@ from carlasc.storage.files import (
 
 RECORD = "carlasc-export.json"
 """The file in a folder that records its exports."""
+
+
+@dataclass(frozen=True)
+class ExportResult:
+    """The result of `export`.
+
+    Attributes:
+        out: root of the data set that was written.
+        sequences: the folder of each sequence in it, or its file where a format has one, by the
+            sequence's path in the source.
+        made: number of frames that were written.
+        skipped: number of frames that existed already.
+        failures: frames that could not be written.
+        notes: remarks about the result, one line each.
+        elapsed_s: duration in seconds.
+    """
+
+    out: Path
+    sequences: dict[str, str]
+    made: int
+    skipped: int
+    failures: tuple[Failure, ...]
+    notes: tuple[str, ...]
+    elapsed_s: float
 
 
 def export(

@@ -9,17 +9,16 @@ import time
 from collections.abc import Collection, Mapping
 from collections.abc import Sequence as Series
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from carlasc.converting.layout_options import LayoutOptions
+from carlasc.converting.assembling import LayoutOptions
 from carlasc.converting.plans import SplitName, choose_recordings, plan_recording, sequence_path
-from carlasc.converting.protocol import Converter, Recording
+from carlasc.converting.protocol import Converter, Failure, Recording, check_outside
 from carlasc.converting.registry import find_recordings, open_converter
-from carlasc.converting.results import ConvertResult, Failure, check_outside
 from carlasc.converting.stages import Conversion
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError, check_choice
@@ -40,6 +39,29 @@ _LOOKED_AT = (
     3  # number of sequences, and of scans of each, in which points outside of the grid are counted
 )
 _MANY = 0.05  # share of the points between the sides of a grid: more points above it give a note
+
+
+@dataclass(frozen=True)
+class ConvertResult:
+    """The result of `convert`.
+
+    Attributes:
+        sequences: locations of the sequences that were written.
+        made: number of frames that were converted.
+        skipped: number of frames that existed before.
+        failures: frames that could not be converted, or whose grid could not be made.
+        grids: locations of the grids that were made from scans.
+        notes: remarks about the result, one line each.
+        elapsed_s: duration in seconds.
+    """
+
+    sequences: tuple[str, ...]
+    made: int
+    skipped: int
+    failures: tuple[Failure, ...]
+    grids: tuple[str, ...]
+    notes: tuple[str, ...]
+    elapsed_s: float
 
 
 def convert(
