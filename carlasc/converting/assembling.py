@@ -17,7 +17,14 @@ from carlasc.core.choices import FlowSource as FlowSource  # noqa: PLC0414 (part
 from carlasc.core.choices import Images as Images  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.geometry import Transform, invert, transform_points
-from carlasc.errors import ArgumentError, CarlascError, FormatError, check_choice, describe
+from carlasc.errors import (
+    ArgumentError,
+    CarlascError,
+    FormatError,
+    check_choice,
+    describe,
+    first_names,
+)
 from carlasc.motion.odometry import move_each, ticks_of
 from carlasc.storage import layout
 from carlasc.storage.metadata import Axes
@@ -25,7 +32,6 @@ from carlasc.storage.metadata import Axes
 _APART_M = 0.25  # positions of a sensor within a sweep that are closer than this count as one
 _IDS = np.iinfo(np.uint16).max + 1
 _UNKNOWN = np.uint32(np.iinfo(np.uint32).max)
-_MAX_LISTED = 8
 
 
 @dataclass(frozen=True)
@@ -118,10 +124,11 @@ class AxesAndClasses:
         if mapped.size and int(mapped.max()) == _UNKNOWN:
             unknown = mapped == _UNKNOWN
             if not self.allow_unknown:
+                counts = zip(*np.unique(labels[unknown], return_counts=True), strict=True)
                 raise FormatError(
                     where,
                     expected=f"class ids of {self.source.name}",
-                    found=_list_ids(labels[unknown]),
+                    found=first_names(f"{label} ({times} times)" for label, times in counts),
                     advice="treat them as unlabelled with `allow_unknown=True`",
                 )
             mapped[unknown] = 0
@@ -134,13 +141,6 @@ def _lookup_table(ids: tuple[int, ...], targets: tuple[int, ...]) -> Uint32Array
     lookup = np.full(_IDS, _UNKNOWN, np.uint32)
     lookup[list(ids)] = targets
     return lookup
-
-
-def _list_ids(labels: LabelArray) -> str:
-    ids, counts = np.unique(labels, return_counts=True)
-    named = [f"{i} ({n} times)" for i, n in zip(ids.tolist(), counts.tolist(), strict=True)]
-    more = f" and {len(named) - _MAX_LISTED} more" if len(named) > _MAX_LISTED else ""
-    return ", ".join(named[:_MAX_LISTED]) + more
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from their files or estimated from their scans.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
@@ -36,7 +36,7 @@ from carlasc.storage.resuming import agree_metadata, agree_poses, agree_times, c
 from carlasc.storage.sinks import SequenceWriter, Sink
 
 if TYPE_CHECKING:
-    from carlasc.motion import odometry
+    from carlasc.motion.odometry import UsableScan
 
 FILE, KISS_ICP = "file", "kiss-icp"
 _ESTIMATE = 'estimate poses from the scans with `poses="kiss-icp"`'
@@ -537,7 +537,7 @@ class _ReadUsable:
 
     rig: Rig
 
-    def __call__(self, handle: FrameHandle) -> odometry.UsableScan | CarlascError | OSError:
+    def __call__(self, handle: FrameHandle) -> UsableScan | CarlascError | OSError:
         from carlasc.motion.odometry import usable_points
 
         try:
@@ -578,59 +578,84 @@ def estimate_poses(
         MissingDataError: no scan has enough points.
         DependencyError: kiss-icp is not installed.
     """
-    from carlasc.motion import odometry
-
     rig = Rig(tuple(recording.sensors), recording.vehicle_T_scan)
-    numbers: list[int] = []
-    read_at: list[float] = []  # times of the frames that were read
     errors: list[CarlascError | OSError] = []
 
-    def scans() -> Iterator[odometry.UsableScan]:
+    def scans() -> Iterator[tuple[int, UsableScan]]:
         with closing(run_all(_ReadUsable(rig), recording.frames, run)) as read:
             for handle, scan in zip(recording.frames, read, strict=True):
                 step()
                 if isinstance(scan, Exception):
                     errors.append(scan)
-                elif len(scan[0]) >= odometry.MIN_POINTS:
-                    numbers.append(handle.number)
-                    read_at.append(float(times[handle.number]))
-                    yield scan
+                else:
+                    yield handle.number, scan
 
-    nearest, farthest = odometry_range(converter)
-    poses = list(
-        odometry.follow_scans(scans(), times=read_at, min_range_m=nearest, max_range_m=farthest)
-    )
+    poses = dict(follow(scans(), converter, times))
     if len(errors) == len(recording.frames):
         raise errors[0]
-    return fill_gaps(numbers, np.array(poses), recording)
+    return fill_gaps(poses, recording)
 
 
-def odometry_range(converter: Converter) -> tuple[float, float]:
-    """Return the least and the greatest range of the points that odometry uses, in metres."""
-    return converter.min_range_m or 0.0, converter.max_range_m or 100.0
+def follow(
+    scans: Iterable[tuple[int, UsableScan]], converter: Converter, times: FloatArray
+) -> Iterator[tuple[int, FloatArray]]:
+    """Yield the frame number and the (4, 4) first_T_scan of each scan with enough points, estimated
+    with KISS-ICP.
+
+    Args:
+        scans: frame numbers and scans, in order.
+        converter: the converter, for the range of points to use.
+        times: (F,) seconds by frame number.
+
+    Raises:
+        DependencyError: kiss-icp is not installed.
+    """
+    from carlasc.motion import odometry
+
+    numbers: list[int] = []
+    read_at: list[float] = []
+
+    def usable() -> Iterator[UsableScan]:
+        for number, scan in scans:
+            if len(scan[0]) >= odometry.MIN_POINTS:
+                numbers.append(number)
+                read_at.append(float(times[number]))
+                yield scan
+
+    yield from (
+        (numbers[index], pose)
+        for index, pose in enumerate(
+            odometry.follow_scans(
+                usable(),
+                times=read_at,
+                min_range_m=converter.min_range_m or 0.0,
+                max_range_m=converter.max_range_m or 100.0,
+            )
+        )
+    )
 
 
-def fill_gaps(frames: list[int], poses: FloatArray, recording: Recording) -> FloatArray:
+def fill_gaps(poses: Mapping[int, FloatArray], recording: Recording) -> FloatArray:
     """Return (F, 4, 4) poses by frame number from those of some frames: others have the pose of the
     frame before.
 
     Args:
-        frames: M frame numbers, increasing.
-        poses: (M, 4, 4) their poses.
+        poses: (4, 4) pose of each, by increasing frame number.
         recording: its last frame is the last that gets a pose.
 
     Raises:
         MissingDataError: there is none.
     """
-    if not frames:
+    if not poses:
         raise MissingDataError(
             recording.location,
             expected="scans to estimate poses from",
             found="none that can be read and has enough points",
             advice="copy the scans again",
         )
-    lines = np.searchsorted(frames, np.arange(recording.frames[-1].number + 1), side="right") - 1
-    return poses[np.clip(lines, 0, None)]
+    every = np.arange(recording.frames[-1].number + 1)
+    lines = np.searchsorted(list(poses), every, side="right") - 1
+    return np.stack(list(poses.values()))[np.clip(lines, 0, None)]
 
 
 def check_poses(recording: Recording, converter: Converter, poses: FloatArray) -> str | None:

@@ -40,7 +40,7 @@ from carlasc.converting.plans import (
     begin,
     estimate_poses,
     fill_gaps,
-    odometry_range,
+    follow,
     write_heights,
     write_poses,
 )
@@ -54,7 +54,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import CarlascError, StorageError
 from carlasc.groundtruth.heights import Ground, find_ground
 from carlasc.motion import Track, tracks_from_boxes
-from carlasc.motion.odometry import usable_points
+from carlasc.motion.odometry import UsableScan, usable_points
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
@@ -331,9 +331,7 @@ class Conversion:
                 self._unnumbered += result.unnumbered
         # otherwise, the failures are reported
         if estimate and len(self._failed) < len(plan.recording.frames):
-            plan.take_estimate(
-                fill_gaps(list(poses), np.array(list(poses.values())), plan.recording)
-            )
+            plan.take_estimate(fill_gaps(poses, plan.recording))
         return {} if actors is None else actors.finish()
 
     def _placed(
@@ -347,22 +345,17 @@ class Conversion:
             for result in usable:
                 yield result, self.plan.poses[result.number]
             return
-        from carlasc.motion.odometry import MIN_POINTS, follow_scans
+        waiting: dict[int, ConvertedFrame] = {}
 
-        waiting: deque[ConvertedFrame] = deque()
-        read_at: list[float] = []
-
-        def scans() -> Iterator[tuple[Float32Array, None]]:
+        def scans() -> Iterator[tuple[int, UsableScan]]:
             for result in usable:
-                if result.points is not None and len(result.points) >= MIN_POINTS:
+                if result.points is not None:
                     points, result.points = result.points, None
-                    waiting.append(result)
-                    read_at.append(float(self.plan.times[result.number]))
-                    yield points, None
+                    waiting[result.number] = result
+                    yield result.number, (points, None)
 
-        nearest, farthest = odometry_range(self.converter)
-        for pose in follow_scans(scans(), times=read_at, min_range_m=nearest, max_range_m=farthest):
-            yield waiting.popleft(), pose
+        for number, pose in follow(scans(), self.converter, self.plan.times):
+            yield waiting.pop(number), pose
 
     def _work(self, blocks: Sequence[Block]) -> Iterator[ConvertedFrame]:
         """Yield the frames of blocks after their conversion; if workers cannot write them, they are

@@ -199,14 +199,7 @@ class Boxes:
 
     def select(self, keep: BoolArray | AnyIntArray) -> Boxes:
         """Return the boxes that a mask of shape (N,) or indices of shape (M,) select."""
-        return Boxes(
-            self.tracks[keep],
-            self.labels[keep],
-            self.centers[keep],
-            self.quaternions[keep],
-            self.sizes[keep],
-            self.annotated[keep],
-        )
+        return Boxes(*(own[keep] for own in vars(self).values()))
 
     def joined(self, others: Boxes) -> Boxes:
         """Return the union of these boxes and others of the same frame.

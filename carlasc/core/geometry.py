@@ -220,45 +220,38 @@ def check_rigid(transforms: AnyFloatArray, name: str, tolerance: float = 1e-3) -
     poses = np.asarray(transforms, np.float64)
     if poses.shape[-2:] != (4, 4) or poses.ndim not in (2, 3):
         raise FormatError(name, expected="4 x 4 transforms", found=f"shape {poses.shape}")
-    if _are_rigid(poses.reshape(-1, 4, 4), tolerance):
-        return poses
-    # find the first one that is not valid, and the reason
-    for index, pose in enumerate(poses.reshape(-1, 4, 4)):
-        where = name if poses.ndim == 2 else f"{name}: transform {index}"
-        if not np.isfinite(pose).all():
-            raise FormatError(where, expected="finite numbers", found="NaN or infinity")
-        if np.abs(pose[:3, 3]).max() > _FARTHEST_M:
-            raise FormatError(
-                where,
-                expected=f"a position within {_FARTHEST_M:.0e} m",
-                found=f"{np.abs(pose[:3, 3]).max():g} m",
-            )
-        rotation = pose[:3, :3]
-        deviation = max(
-            np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(pose[3] - (0, 0, 0, 1)).max()
+    flat = poses.reshape(-1, 4, 4)
+    rotations, farthest = flat[:, :3, :3], np.abs(flat[:, :3, 3]).max(axis=1)
+    with np.errstate(invalid="ignore", over="ignore"):
+        deviation = np.maximum(
+            np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(axis=(1, 2)),
+            np.abs(flat[:, 3] - (0, 0, 0, 1)).max(axis=1),
         )
-        if deviation > tolerance:
-            raise FormatError(
-                where,
-                expected="a rigid transform",
-                found=f"a deviation of {deviation:.3g} from a rigid transform",
-                advice="the transform may be scaled or sheared, or may not be a pose",
-            )
-        if np.linalg.det(rotation) < 0:
-            raise FormatError(
-                where,
-                expected="a rotation",
-                found="a reflection (determinant -1)",
-                advice="the axes may be mirrored: check their handedness",
-            )
+        mirrored = np.asarray(np.linalg.det(rotations) < 0)
+    checks = (
+        (~np.isfinite(flat).all(axis=(1, 2)), "finite numbers", "NaN or infinity", ""),
+        (farthest > _FARTHEST_M, f"a position within {_FARTHEST_M:.0e} m", "{0:g} m", ""),
+        (
+            deviation > tolerance,
+            "a rigid transform",
+            "a deviation of {1:.3g} from a rigid transform",
+            "the transform may be scaled or sheared, or may not be a pose",
+        ),
+        (
+            mirrored,
+            "a rotation",
+            "a reflection (determinant -1)",
+            "the axes may be mirrored: check their handedness",
+        ),
+    )
+    wrong = np.any([mask for mask, *_ in checks], axis=0)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        expected, found, advice = next(parts for mask, *parts in checks if mask[row])
+        raise FormatError(
+            name if poses.ndim == 2 else f"{name}: transform {row}",
+            expected=expected,
+            found=found.format(farthest[row], deviation[row]),
+            advice=advice,
+        )
     return poses
-
-
-def _are_rigid(poses: FloatArray, tolerance: float) -> bool:
-    """Return whether all of (F, 4, 4) transforms are finite, rigid and proper."""
-    if not np.isfinite(poses).all() or np.abs(poses[:, :3, 3]).max(initial=0.0) > _FARTHEST_M:
-        return False
-    rotations = poses[:, :3, :3]
-    deviation = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(initial=0.0)
-    last = np.abs(poses[:, 3] - (0, 0, 0, 1)).max(initial=0.0)
-    return bool(max(deviation, last) <= tolerance and (np.linalg.det(rotations) >= 0).all())

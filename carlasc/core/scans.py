@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -117,19 +117,13 @@ class Scan:
         """Return a scan with the points selected by an (N,) mask or (M,) indices, with all their
         fields. Boxes are kept.
         """
-
-        def chosen(values: AnyArray | None) -> AnyArray | None:
-            return None if values is None else values[keep]
-
-        return Scan(
-            self.points[keep],
-            chosen(self.labels),
-            chosen(self.flow),
-            chosen(self.instances),
-            chosen(self.remission),
-            {name: values[keep] for name, values in self.others.items()},
-            self.boxes,
-        )
+        others = {name: values[keep] for name, values in self.others.items()}
+        own = {
+            name: getattr(self, name)[keep]
+            for name in ("points", *self.fields())
+            if name not in others
+        }
+        return replace(self, others=others, **own)
 
 
 def sorted_by_origin(origins: AnyFloatArray) -> IntArray:
