@@ -5,7 +5,6 @@ prints its result.
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import sys
 from collections import UserDict
 from collections.abc import Sequence
@@ -109,8 +108,7 @@ class _DeclaringCommand(Command):
 class _Group(CommandGroup):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        installed = (name for name in _COMMANDS if importlib.util.find_spec(f"carlasc.cli.{name}"))
-        self.commands = _Commands(dict.fromkeys(installed))
+        self.commands = _Commands(dict.fromkeys(_COMMANDS))
 
     def list_commands(self, ctx: Any) -> list[str]:
         return list(self.commands)

@@ -34,12 +34,12 @@ from carlasc.core.arrays import (
     LabelArray,
     Uint32Array,
 )
-from carlasc.core.axes import mirror_boxes, mirror_points
-from carlasc.core.boxes import Boxes
+from carlasc.core.boxes import Boxes, mirror_boxes
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import (
     Transform,
     invert,
+    mirror_points,
     multiply,
     rotate_vectors,
     thin,
@@ -398,14 +398,13 @@ def _boxes_of(job: MotionJob, tracks: Sequence[Track]) -> Boxes:
             and np.linalg.norm((scan_T_first @ pose)[:3, 3]) < _FAR_M
         ):
             filled.setdefault(track.instance, (track, scan_T_first @ pose))
+    kept = [track for track, _ in filled.values()]
     more = Boxes.from_poses(
         np.array(list(filled), np.uint32),
-        np.array([track.label for track, _ in filled.values()], np.uint32),
+        np.array([track.label for track in kept], np.uint32),
         np.array([pose for _, pose in filled.values()]).reshape(-1, 4, 4),
-        np.array([track.extent.upper - track.extent.lower for track, _ in filled.values()]).reshape(
-            -1, 3
-        ),
-        np.zeros(len(filled), np.bool_),
+        np.array([track.extent.upper - track.extent.lower for track in kept]),
+        np.zeros(len(kept), np.bool_),
     )
     return more if job.boxes is None else job.boxes.joined(more)
 

@@ -12,11 +12,10 @@ import numpy as np
 
 from carlasc.converting.protocol import Cloud, Converter, FrameHandle, Sensor, Trajectory
 from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, LabelArray, Uint32Array
-from carlasc.core.axes import mirror_points
 from carlasc.core.choices import FlowSource as FlowSource  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import Images as Images  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable, Remap
-from carlasc.core.geometry import Transform, invert, transform_points
+from carlasc.core.geometry import Transform, invert, mirror_points, transform_points
 from carlasc.errors import (
     ArgumentError,
     CarlascError,

@@ -16,12 +16,11 @@ import numpy as np
 from carlasc.converting.assembling import AxesAndClasses, Rig, VehicleMotion, read_scan
 from carlasc.converting.protocol import Converter, FrameHandle, Recording, Trajectory
 from carlasc.core.arrays import FloatArray
-from carlasc.core.axes import mirror_poses, mirror_spec
 from carlasc.core.boxes import Boxes
 from carlasc.core.choices import SplitName as SplitName  # noqa: PLC0414 (part of this module)
 from carlasc.core.frames import check_seconds
-from carlasc.core.geometry import invert, relative_to
-from carlasc.core.grids import GridSpec
+from carlasc.core.geometry import invert, mirror_poses, relative_to
+from carlasc.core.grids import GridSpec, mirror_spec
 from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError
 from carlasc.inspection.alignment import diagnose_poses
 from carlasc.inspection.pose_quality import describe_mounting

@@ -138,12 +138,8 @@ def convert(
     ]
     origin = f"{name if isinstance(name, str) else name.__name__} {root.name}"
     ranges = converter.min_range_m, converter.max_range_m
-    said = {
-        "license": converter.license,
-        "citation": converter.citation,
-        "simulated": converter.simulated or None,
-    }
-    known = {key: value for key, value in said.items() if value is not None}
+    said = {name: getattr(converter, name) for name in ("license", "citation", "simulated")}
+    known = {key: value for key, value in said.items() if value not in (None, False)}
     metadata = Metadata(layout.axes, target.classes, converter.sensor, *ranges, origin, known)
 
     steps = StepCounter(run.progress, sum(len(plan.recording.frames) for plan in plans))
@@ -171,9 +167,7 @@ def convert(
     failures = [failure for conversion in conversions for failure in conversion.failures]
     notes = [note for conversion in conversions for note in conversion.notes]
     if made is not None:
-        failures += [
-            Failure(failure.sequence, failure.frame, failure.message) for failure in made.failures
-        ]
+        failures += [Failure(one.sequence, one.frame, one.message) for one in made.failures]
         notes += made.notes
     return ConvertResult(
         tuple(sink.place(sequence_path(recording)) for recording in recordings),
@@ -261,10 +255,8 @@ def _what_is_cut(spec: GridSpec, source: Source) -> list[str]:
         for frame in frames[:: max(len(frames) // _LOOKED_AT, 1)][:_LOOKED_AT]:
             axes = spec.to_axes(sequence.read("points", int(frame))[:, :3])
             heights = axes[((axes >= spec.lower) & (axes < spec.upper))[:, :2].all(axis=1), 2]
-            within, above = (
-                within + len(heights),
-                above + int(np.count_nonzero(heights >= spec.upper[2])),
-            )
+            within += len(heights)
+            above += int(np.count_nonzero(heights >= spec.upper[2]))
     if above <= _MANY * within:
         return []
     return [
@@ -278,14 +270,10 @@ def _deal(recordings: Series[Recording], part: Part) -> list[Recording]:
     """Return the recordings of a part: those with their middle frame in its share of all frames."""
     if part.count == 1:
         return list(recordings)
-    ends = np.cumsum([len(recording.frames) for recording in recordings])
-    middles = ends - np.array([len(recording.frames) for recording in recordings]) / 2
-    shares = np.minimum(middles * part.count // max(ends[-1], 1), part.count - 1)
-    return [
-        recording
-        for recording, share in zip(recordings, shares, strict=True)
-        if share == part.number - 1
-    ]
+    frames = np.array([len(recording.frames) for recording in recordings])
+    middles = np.cumsum(frames) - frames / 2
+    shares = np.minimum(middles * part.count // max(frames.sum(), 1), part.count - 1)
+    return [recordings[index] for index in np.flatnonzero(shares == part.number - 1).tolist()]
 
 
 def _check(source: Path, sink: Sink, split: str, grids: Grids, part: Part) -> None:

@@ -46,11 +46,10 @@ from carlasc.converting.plans import (
 )
 from carlasc.converting.protocol import Converter, Failure, FrameHandle
 from carlasc.core.arrays import AnyArray, Float32Array, FloatArray
-from carlasc.core.axes import mirror_grid
 from carlasc.core.boxes import Boxes
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import invert
-from carlasc.core.grids import GridSpec
+from carlasc.core.grids import GridSpec, mirror_grid
 from carlasc.errors import CarlascError, StorageError
 from carlasc.groundtruth.heights import Ground, find_ground
 from carlasc.motion import Track, tracks_from_boxes
@@ -451,11 +450,10 @@ class Conversion:
             )
             for number, own in plan.boxes.items()
         }
-        numbers = sorted({handle.number for handle in plan.recording.frames} | set(boxes))
+        poses = {number: plan.poses[number] for number in boxes}
+        numbers = sorted(poses.keys() | {handle.number for handle in plan.recording.frames})
         times = {number: float(plan.times[number]) for number in numbers}
-        return tracks_from_boxes(
-            boxes, {number: plan.poses[number] for number in boxes}, times
-        ), boxes
+        return tracks_from_boxes(boxes, poses, times), boxes
 
     def _find_ground(self) -> None:
         """Find the ground in some of the scans, and write the height of the sensor if the data set
@@ -476,15 +474,13 @@ class Conversion:
     def _remarks(self) -> list[str]:
         plan = self.plan
         notes = [*plan.recording.notes(), *plan.notes]
+        unlabelled = sum(not handle.labelled for handle in plan.recording.frames)
         if plan.boxes is not None and not plan.recording.has_labels:
             notes.append(
                 "points have no labels: points in boxes got the class of the box, others are "
                 "ground or have no class"
             )
-        elif plan.boxes is not None and not all(
-            handle.labelled for handle in plan.recording.frames
-        ):
-            unlabelled = sum(not handle.labelled for handle in plan.recording.frames)
+        elif plan.boxes is not None and unlabelled:
             notes.append(
                 f"{unlabelled} scans have no labels: their points got the class of the box that "
                 f"they are in, or of labelled points nearby"
@@ -499,10 +495,9 @@ class Conversion:
                 f"unknown and set to 0"
             )
         first, last = plan.recording.frames[0].number, plan.recording.frames[-1].number
-        if gaps := last - first + 1 - len(plan.recording.frames):
-            notes.append(
-                f"{gaps} of the {last - first + 1} frames from {first} to {last} have no scan"
-            )
+        every = last - first + 1
+        if gaps := every - len(plan.recording.frames):
+            notes.append(f"{gaps} of the {every} frames from {first} to {last} have no scan")
         return [f"{plan.writer.location}: {note}" for note in notes]
 
 
@@ -571,8 +566,5 @@ def _copy_images(plan: RecordingPlan, cameras: Sequence[CameraModel]) -> list[st
                 )
         if by_frame:
             plan.writer.write_frames(by_frame)
-    return (
-        [f"{missing} images of cameras do not exist, or are neither .jpg nor .png"]
-        if missing
-        else []
-    )
+    note = f"{missing} images of cameras do not exist, or are neither .jpg nor .png"
+    return [note] if missing else []

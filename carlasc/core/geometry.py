@@ -1,16 +1,21 @@
-"""Rigid transforms.
+"""Rigid transforms, and the conversion between right-handed axes and those of CarlaSC.
 
 A transform named `dst_T_src` converts points from frame `src` to frame `dst`: `R @ p + t`.
+
+Right-handed axes (y to the left) and the left-handed axes of CarlaSC (y to the right) differ in the
+sign of y, so each function named `mirror_...` works in both directions.
 """
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from carlasc.core.arrays import AnyFloatArray, FloatArray
+from carlasc.core.arrays import AnyFloatArray, Float32Array, FloatArray
 from carlasc.errors import FormatError
 
 Floating = TypeVar("Floating", bound=np.floating[Any])
@@ -18,6 +23,8 @@ Floating = TypeVar("Floating", bound=np.floating[Any])
 Transform = FloatArray
 """(4, 4) float64, last row 0 0 0 1."""
 
+_SIGNS = np.array([1, -1, 1, 1], np.float32)
+_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 _FARTHEST_M = 1e9  # larger than any distance on Earth
 
 
@@ -227,8 +234,8 @@ def check_rigid(transforms: AnyFloatArray, name: str, tolerance: float = 1e-3) -
             np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(axis=(1, 2)),
             np.abs(flat[:, 3] - (0, 0, 0, 1)).max(axis=1),
         )
-        mirrored = np.asarray(np.linalg.det(rotations) < 0)
-    checks = (
+        mirrored = np.linalg.det(rotations) < 0
+    checks: tuple[tuple[Any, str, str, str], ...] = (
         (~np.isfinite(flat).all(axis=(1, 2)), "finite numbers", "NaN or infinity", ""),
         (farthest > _FARTHEST_M, f"a position within {_FARTHEST_M:.0e} m", "{0:g} m", ""),
         (
@@ -255,3 +262,30 @@ def check_rigid(transforms: AnyFloatArray, name: str, tolerance: float = 1e-3) -
             advice=advice,
         )
     return poses
+
+
+def mirror_points(points: Float32Array) -> Float32Array:
+    """Mirror (N, 3) or (N, 4) points or vectors. A fourth column is unchanged."""
+    return points * _SIGNS[: points.shape[1]]
+
+
+def mirror_poses(poses: FloatArray) -> FloatArray:
+    """Mirror (..., 4, 4) poses, in both the source and the destination frame."""
+    return _MIRROR @ poses @ _MIRROR
+
+
+def choices_of_axes() -> Iterator[tuple[str, FloatArray]]:
+    """Yield the 48 signed permutations of axes, the identity first: the new axes in terms of the
+    old ones, such as "-y, x, z", and the (3, 3) matrix.
+    """
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[range(3), order] = signs
+            yield (
+                ", ".join(
+                    f"{'-' if s < 0 else ''}{'xyz'[axis]}"
+                    for s, axis in zip(signs, order, strict=True)
+                ),
+                matrix,
+            )

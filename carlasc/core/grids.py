@@ -11,9 +11,10 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntFlag
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from carlasc.core.arrays import (
     AnyArray,
@@ -31,6 +32,7 @@ from carlasc.core.choices import Preset
 from carlasc.core.notebook import describe
 from carlasc.errors import ArgumentError, FormatError, check_choice
 
+_Scalar = TypeVar("_Scalar", bound=np.generic)
 Triple = tuple[float, float, float]
 
 # a little above pi: an azimuth of exactly pi is inside the published bounds
@@ -459,3 +461,23 @@ def is_confident(occupied: AnyFloatArray, min_confidence: float) -> BoolArray:
     p = np.asarray(occupied, np.float16)
     confident: BoolArray = np.maximum(p, 1 - p) >= np.float16(min_confidence)
     return confident
+
+
+def mirror_grid(grid: NDArray[_Scalar]) -> NDArray[_Scalar]:
+    """Mirror an (X, Y, Z) grid along its second axis: y (Cartesian) or azimuth (cylindrical)."""
+    mirrored: AnyArray = grid[:, ::-1]
+    return mirrored
+
+
+def mirror_spec(spec: GridSpec) -> GridSpec:
+    """Return the geometry of a mirrored grid: the bounds of y, or of the azimuth, are swapped and
+    negated.
+    """
+    (x0, y0, z0), (x1, y1, z1) = spec.lower, spec.upper
+    return GridSpec(spec.coordinates, spec.size, (x0, -y1, z0), (x1, -y0, z1))
+
+
+def mirror_voxels(grid: Grid) -> Grid:
+    """Mirror a grid with its geometry."""
+    counts = None if grid.counts is None else mirror_grid(grid.counts)
+    return Grid(mirror_spec(grid.spec), mirror_grid(grid.labels), counts)

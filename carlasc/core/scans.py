@@ -21,8 +21,8 @@ from carlasc.core.arrays import (
     Uint16Array,
     Uint32Array,
 )
-from carlasc.core.boxes import Boxes
-from carlasc.core.geometry import Transform, invert, transform_points, translation
+from carlasc.core.boxes import Boxes, mirror_boxes
+from carlasc.core.geometry import Transform, invert, mirror_points, transform_points, translation
 from carlasc.core.grids import GridSpec
 from carlasc.core.notebook import describe
 from carlasc.errors import FormatError, count
@@ -262,3 +262,16 @@ def check_finite(points: AnyFloatArray, name: str) -> None:
         raise FormatError(
             name, expected="finite coordinates", found=f"{points[row].tolist()} at point {row}"
         )
+
+
+def mirror_scan(scan: Scan) -> Scan:
+    """Mirror a scan: points, flow, ray origins and boxes."""
+    return replace(
+        scan,
+        points=mirror_points(scan.points),
+        flow=None if scan.flow is None else mirror_points(scan.flow),
+        others={
+            name: mirror_points(v) if name == "origins" else v for name, v in scan.others.items()
+        },
+        boxes=None if scan.boxes is None else mirror_boxes(scan.boxes),
+    )

@@ -75,7 +75,7 @@ def test_each_field_of_an_option_object_is_an_option_with_its_default(made):
     for name, parameter in options.items():
         named = re.search(r"\[default: (.*)\]$", get_args(parameter.annotation)[1].help)
         default = fields[name]
-        if default is None or default is False or default == ():
+        if default in (None, (), dataclasses.MISSING) or default is False:
             assert named is None
         else:
             text = ":".join(map(str, default)) if isinstance(default, tuple) else str(default)

@@ -18,8 +18,9 @@ from carlasc.converting.plans import (
 from carlasc.converting.protocol import check_outside
 from carlasc.converting.stages import Block, ScanJob, ScanStage
 from carlasc.core import REMAPS, SEMANTICKITTI, Boxes, GridSpec
-from carlasc.core.axes import mirror_boxes, mirror_grid, mirror_points, mirror_poses, mirror_spec
-from carlasc.core.geometry import rotation_z, translation
+from carlasc.core.boxes import mirror_boxes
+from carlasc.core.geometry import mirror_points, mirror_poses, rotation_z, translation
+from carlasc.core.grids import mirror_grid, mirror_spec
 from carlasc.errors import ConflictError, FormatError, MissingDataError, StorageError
 from carlasc.motion import PoseOptions
 from carlasc.storage import Metadata, layout
