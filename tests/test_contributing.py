@@ -14,9 +14,7 @@ from helpers.errors import raises
 import carlasc
 from carlasc import Run
 from carlasc.converting import Cloud, Sensor
-from carlasc.converting.assembling import Rig, assemble
-from carlasc.converting.frame_stages import make_fields
-from carlasc.converting.layout_options import AxesAndClasses
+from carlasc.converting.assembling import AxesAndClasses, Rig, assemble, make_fields
 from carlasc.core.tables import CARLA
 from carlasc.errors import FormatError
 from carlasc.groundtruth import FromScans

@@ -20,6 +20,7 @@ import pytest
 
 import carlasc
 from carlasc import cli
+from carlasc.cli.flags import declared_by
 from carlasc.converting import converter_names, exporter_names
 
 ROOT = Path(__file__).parents[1]
@@ -285,8 +286,9 @@ def declared_options(name):
     if name not in ("convert", "export"):
         return set()
     names = converter_names() if name == "convert" else exporter_names()
-    declared = import_module(f"carlasc.cli.{name}").declared_options
-    commands = [cli.make_command(name, options) for one in names if (options := declared([one]))]
+    kind = import_module(f"carlasc.cli.{name}").DECLARED_BY
+    declared = [declared_by(kind, [one]) for one in names]
+    commands = [cli.make_command(name, options) for options in declared if options]
     documented = {"--above-m"} if name == "export" else set()  # of the exporter that a page writes
     return documented.union(*map(options_of, commands))
 

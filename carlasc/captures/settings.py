@@ -75,26 +75,21 @@ class Lidar:
     noise_m: float = 0.02
 
     def __post_init__(self) -> None:
-        if self.channels < 1:
-            raise ArgumentError("channels", expected="at least 1", found=str(self.channels))
-        if self.points < self.channels:
-            raise ArgumentError(
-                "points",
-                expected=f"at least one per channel ({self.channels})",
-                found=str(self.points),
-            )
-        if not 0 < self.range_m < 1000:
-            raise ArgumentError(
-                "range_m", expected="more than 0 and less than 1000 m", found=str(self.range_m)
-            )
-        if not -90 <= self.lower_deg <= self.upper_deg <= 90:
-            raise ArgumentError(
+        each, low, high = self.channels, self.lower_deg, self.upper_deg
+        for valid, name, expected, found in (
+            (each >= 1, "channels", "at least 1", each),
+            (self.points >= each, "points", f"at least one per channel ({each})", self.points),
+            (0 < self.range_m < 1000, "range_m", "more than 0 and less than 1000 m", self.range_m),
+            (
+                -90 <= low <= high <= 90,
                 "upper_deg",
-                expected="-90 <= lower_deg <= upper_deg <= 90",
-                found=f"{self.lower_deg} and {self.upper_deg}",
-            )
-        if not 0 <= self.noise_m < np.inf:
-            raise ArgumentError("noise_m", expected="0 m or more", found=str(self.noise_m))
+                "-90 <= lower_deg <= upper_deg <= 90",
+                f"{low} and {high}",
+            ),
+            (0 <= self.noise_m < np.inf, "noise_m", "0 m or more", self.noise_m),
+        ):
+            if not valid:
+                raise ArgumentError(name, expected=expected, found=str(found))
 
     @cached_property
     def directions(self) -> FloatArray:

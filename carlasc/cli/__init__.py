@@ -5,7 +5,6 @@ prints its result.
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import sys
 from collections import UserDict
 from collections.abc import Sequence
@@ -16,7 +15,7 @@ import typer
 
 from carlasc.cli.commands import Command, CommandGroup
 from carlasc.cli.common import echo
-from carlasc.cli.flags import flatten
+from carlasc.cli.flags import declared_by, flatten
 from carlasc.core.first_use import note_compiling, say_compiling
 
 if TYPE_CHECKING:
@@ -76,9 +75,8 @@ def make_command(name: str, declared: Sequence[OptionDeclaration] = ()) -> Any:
         declared: the options that a converter or an exporter declares.
     """
     module = _module(name)
-    takes_declared = hasattr(module, "declared_options")
     single = typer.Typer(add_completion=False, **_SETTINGS)
-    cls = _DeclaringCommand if takes_declared and not declared else Command
+    cls = _DeclaringCommand if hasattr(module, "DECLARED_BY") and not declared else Command
     function = flatten(getattr(module, name), declared)
     single.command(name, cls=cls)(function)
     made: Any = typer.main.get_command(single)
@@ -101,7 +99,7 @@ class _DeclaringCommand(Command):
     ) -> Any:
         """Read the arguments, including the options of the converter or exporter."""
         name = self.name or ""
-        declared = _module(name).declared_options(args)
+        declared = declared_by(_module(name).DECLARED_BY, args)
         if not declared:
             return super().make_context(info_name, args, parent, **extra)
         return make_command(name, declared).make_context(info_name, args, parent, **extra)
@@ -110,8 +108,7 @@ class _DeclaringCommand(Command):
 class _Group(CommandGroup):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        installed = (name for name in _COMMANDS if importlib.util.find_spec(f"carlasc.cli.{name}"))
-        self.commands = _Commands(dict.fromkeys(installed))
+        self.commands = _Commands(dict.fromkeys(_COMMANDS))
 
     def list_commands(self, ctx: Any) -> list[str]:
         return list(self.commands)

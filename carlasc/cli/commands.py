@@ -49,7 +49,7 @@ class _Converting:
 
 
 class Command(_Converting, TyperCommand):
-    """A command whose help is plain text, and whose errors are one line on stderr and an exit code."""
+    """A command with plain help, whose errors are one line on stderr and an exit code."""
 
     def make_context(
         self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any

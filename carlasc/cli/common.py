@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -52,7 +53,7 @@ def read_place(parameter: typer.CallbackParam, place: str | None) -> str | None:
     return str(Path(place).expanduser()) if place.startswith("~") else place
 
 
-def _read_places(parameter: typer.CallbackParam, places: list[str]) -> list[str | None]:
+def read_places(parameter: typer.CallbackParam, places: list[str]) -> list[str | None]:
     """Return several paths or URLs, each as `read_place` does."""
     return [read_place(parameter, place) for place in places]
 
@@ -73,35 +74,25 @@ def read_file(parameter: typer.CallbackParam, file: Path | None) -> Path | None:
     )
 
 
-def place_argument(text: str, name: str = "SOURCE", default: str | None = None) -> Any:
+def place_argument(
+    text: str, name: str = "SOURCE", default: str | None = None, read: Any = read_place
+) -> Any:
     """Return an argument for a path or a URL. `text` is its help, `name` its name in the help."""
-    return typer.Argument(
-        metavar=name, help=text, callback=read_place, show_default=default or True
-    )
-
-
-def places_argument(text: str, name: str = "SOURCES") -> Any:
-    """Return an argument for one or more paths or URLs.
-
-    `text` is its help, `name` its name in the help.
-    """
-    return typer.Argument(metavar=name, help=text, callback=_read_places)
-
-
-def place_option(*flags: str, text: str) -> Any:
-    """Return an option for a path or a URL."""
-    return typer.Option(*flags, help=text, callback=read_place)
+    return typer.Argument(metavar=name, help=text, callback=read, show_default=default or True)
 
 
 def file_argument(text: str, name: str = "OUT") -> Any:
     """Return an argument for a path on this machine, where files of other formats are written."""
-    return typer.Argument(metavar=name, help=text, callback=read_file)
+    return place_argument(text, name, read=read_file)
 
 
-def file_option(*flags: str, text: str, **settings: Any) -> Any:
-    """Return an option for a path on this machine."""
-    return typer.Option(*flags, help=text, callback=read_file, **settings)
+def place_option(*flags: str, text: str, read: Any = read_place, **settings: Any) -> Any:
+    """Return an option for a path or a URL."""
+    return typer.Option(*flags, help=text, callback=read, **settings)
 
+
+file_option = partial(place_option, read=read_file)
+"""Return an option for a path on this machine."""
 
 SourceArgument = Annotated[
     str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")

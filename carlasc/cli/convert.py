@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import typer
 
@@ -18,15 +17,13 @@ from carlasc.cli.common import (
     print_json,
     starting_with,
 )
-from carlasc.cli.flags import DeclaredOptions, RunFlags, declared_by
+from carlasc.cli.flags import DeclaredOptions, RunFlags
 from carlasc.cli.grid_flags import GroundTruthFlags, PosesGiven
 from carlasc.cli.library import Given, Library
 from carlasc.errors import ArgumentError, count
 
-
-def declared_options(arguments: Sequence[str]) -> tuple[carlasc.converting.OptionDeclaration, ...]:
-    """Return the options of the converter that the arguments name, if they name one."""
-    return declared_by("converter", arguments)
+DECLARED_BY: Final = "converter"
+"""What declares options of this command, if its arguments name one."""
 
 
 def _print_list(wanted: bool) -> None:

@@ -29,13 +29,8 @@ def doctor(as_json: Json = False) -> None:
 
 
 def _lines(found: Installation) -> Iterator[str]:
-    width = max(
-        map(
-            len,
-            [extra.name for extra in found.extras] + [package.name for package in found.packages],
-        ),
-        default=0,
-    )
+    names = [one.name for one in found.extras] + [one.name for one in found.packages]
+    width = max(map(len, names), default=0)
     yield f"carlasc {found.version}, in {found.folder}"
     yield f"Python {found.python}"
     yield found.system
@@ -48,8 +43,10 @@ def _lines(found: Installation) -> Iterator[str]:
     cpu = found.processor
     yield "\nprocessor"
     yield f"  {cpu.model}, {cpu.cores} cores, {cpu.usable} usable"
-    yield f"  Numba compiles for {cpu.target or 'nothing'}: {' '.join(cpu.features) or 'unknown instructions'}"
-    yield f"  threads: {', '.join(f'{name} {value}' for name, value in found.threads.items()) or 'no settings'}"
+    features = " ".join(cpu.features) or "unknown instructions"
+    yield f"  Numba compiles for {cpu.target or 'nothing'}: {features}"
+    threads = ", ".join(f"{name} {value}" for name, value in found.threads.items())
+    yield f"  threads: {threads or 'no settings'}"
     if (code := found.compiled) is not None:
         state = (
             "writable"

@@ -13,7 +13,6 @@ import typer
 import carlasc
 from carlasc.cli.common import (
     Json,
-    console,
     echo,
     file_option,
     place_argument,
@@ -215,7 +214,7 @@ def _print_tables(tables: Sequence[FigureTable], remark: str, output: OutputFlag
         )
         return
     for table in tables:
-        print_table(console(), table.header, table.texts(), title=f"{table.title} ({remark})")
+        print_table(table.header, table.texts(), title=f"{table.title} ({remark})")
 
 
 def _print(result: Evaluation, other: Evaluation | None, output: OutputFlags) -> None:
@@ -297,19 +296,18 @@ def _print_conventions(results: Mapping[str, Any], as_json: bool) -> None:
             }
         )
     else:
-        rows, reasons = [], []
+        rows, reasons = list[list[object]](), []
         for name, result in results.items():
             if isinstance(result, CarlascError):
-                rows.append([name, "-", "-", "-", "-", "-"])
+                rows.append([name, *"-----"])
                 reasons.append(f"{name}: {result}")
                 continue
             score = result.score
             figures = [score.miou, score.iou, score.precision, score.recall]
-            shown = ["-" if math.isnan(value) else f"{100 * value:.2f}" for value in figures]
-            rows.append([name, str(result.matrix.total), *shown])
+            shown = ["-" if math.isnan(value) else 100 * value for value in figures]
+            rows.append([name, result.matrix.total, *shown])
         header = ["Convention", "Voxels", "mIoU", "IoU", "Precision", "Recall"]
         print_table(
-            console(),
             header,
             rows,
             title="The same predictions by each convention (percent)",

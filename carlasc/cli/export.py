@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -17,13 +16,11 @@ from carlasc.cli.common import (
     print_frames,
     starting_with,
 )
-from carlasc.cli.flags import DeclaredOptions, RunFlags, declared_by
+from carlasc.cli.flags import DeclaredOptions, RunFlags
 from carlasc.cli.library import Given, Library
 
-
-def declared_options(arguments: Sequence[str]) -> tuple[carlasc.converting.OptionDeclaration, ...]:
-    """Return the options of the exporter that the arguments name, if they name one."""
-    return declared_by("exporter", arguments)
+DECLARED_BY: Final = "exporter"
+"""What declares options of this command, if its arguments name one."""
 
 
 def _print_list(wanted: bool) -> None:

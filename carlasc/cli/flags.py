@@ -11,7 +11,7 @@ import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import MISSING, dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_args, get_type_hints
 
 import typer
 
@@ -46,12 +46,47 @@ class Flags:
             for field, value in values
         )
 
+    @classmethod
+    def parameters(cls) -> Iterator[inspect.Parameter]:
+        """Yield the options of the group, each under its heading."""
+        hints = get_type_hints(cls, include_extras=True)
+        for field in dataclasses.fields(cls):
+            hint = hints[field.name]
+            if (inner := _group(hint)) is not None:
+                yield from inner.parameters()
+                continue
+            kind: Any
+            kind, info = get_args(hint)
+            info = copy.copy(info)
+            info.rich_help_panel = cls.heading or None
+            default = inspect.Parameter.empty if field.default is MISSING else field.default
+            annotation = Annotated[kind, info]
+            yield inspect.Parameter(
+                field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
+            )
+
+    @classmethod
+    def take(cls, given: dict[str, Any]) -> Self:
+        """Take the values of these options out of those that a command was given."""
+        hints = get_type_hints(cls, include_extras=True)
+        inner = {field.name: _group(hints[field.name]) for field in dataclasses.fields(cls)}
+        return cls(
+            **{name: one.take(given) if one else given.pop(name) for name, one in inner.items()}
+        )
+
 
 @dataclass(frozen=True)
 class DeclaredOptions(Flags):
     """The options that a converter or an exporter declares: the given values by name."""
 
     values: Mapping[str, Any]
+
+    @classmethod
+    def take(cls, given: dict[str, Any]) -> Self:
+        """Take the values of these options out of those that a command was given."""
+        names = [name for name in given if name.startswith(_DECLARED)]
+        values = {name.removeprefix(_DECLARED): given.pop(name) for name in names}
+        return cls({name: value for name, value in values.items() if value is not None})
 
 
 def flatten(
@@ -67,17 +102,17 @@ def flatten(
     """
     hints = get_type_hints(function, include_extras=True)
     parameters: list[inspect.Parameter] = []
-    groups: dict[str, Any] = {}
+    groups: dict[str, type[Flags] | Library] = {}
     for name, parameter in inspect.signature(function).parameters.items():
         if (group := _group(hints[name])) is None:
             annotated = parameter.replace(annotation=hints[name], kind=parameter.KEYWORD_ONLY)
             parameters.append(annotated)
             continue
         groups[name] = group
-        parameters += map(_declared, declared) if group is DeclaredOptions else _parameters(group)
+        parameters += map(_declared, declared) if group is DeclaredOptions else group.parameters()
 
     def command(**given: Any) -> None:
-        function(**{name: _make(group, given) for name, group in groups.items()}, **given)
+        function(**{name: group.take(given) for name, group in groups.items()}, **given)
 
     command.__name__, command.__doc__ = function.__name__, function.__doc__
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -111,43 +146,6 @@ def _group(hint: Any) -> type[Flags] | Library | None:
         return hint if issubclass(hint, Flags) else None
     mark = get_args(hint)[-1]
     return mark if isinstance(mark, Library) else None
-
-
-def _parameters(group: type[Flags] | Library) -> Iterator[inspect.Parameter]:
-    """Yield the options of a group, each under the heading of the group."""
-    if isinstance(group, Library):
-        yield from group.parameters()
-        return
-    hints = get_type_hints(group, include_extras=True)
-    for field in dataclasses.fields(group):
-        hint = hints[field.name]
-        if (inner := _group(hint)) is not None:
-            yield from _parameters(inner)
-            continue
-        kind: Any
-        kind, info = get_args(hint)
-        info = copy.copy(info)
-        info.rich_help_panel = group.heading or None
-        default = inspect.Parameter.empty if field.default is MISSING else field.default
-        annotation = Annotated[kind, info]
-        yield inspect.Parameter(
-            field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
-        )
-
-
-def _make(group: type[Flags] | Library, given: dict[str, Any]) -> Flags | Given:
-    """Take the values of a group's options out of those that are given."""
-    if isinstance(group, Library):
-        return group.take(given)
-    if group is DeclaredOptions:
-        names = [name for name in given if name.startswith(_DECLARED)]
-        values = {name.removeprefix(_DECLARED): given.pop(name) for name in names}
-        return DeclaredOptions({name: value for name, value in values.items() if value is not None})
-    hints = get_type_hints(group, include_extras=True)
-    inner = {field.name: _group(hints[field.name]) for field in dataclasses.fields(group)}
-    return group(
-        **{name: _make(one, given) if one else given.pop(name) for name, one in inner.items()}
-    )
 
 
 def _declared(option: OptionDeclaration) -> inspect.Parameter:

@@ -34,12 +34,13 @@ def info(
 def _print(overview: Overview) -> None:
     from carlasc.cli.tables import print_table
 
-    out = console()
     names = {name: number for name, number in overview.splits.items() if name != "none"}
     splits = (
         f" ({', '.join(f'{name} {number}' for name, number in names.items())})" if names else ""
     )
-    out.print(line(overview.location, "bold") + line(f": {overview.level} ({overview.store})"))
+    console().print(
+        line(overview.location, "bold") + line(f": {overview.level} ({overview.store})")
+    )
     if overview.sequences:
         size = f", {_size(overview.bytes)}" if overview.bytes is not None else ""
         show(f"{count(len(overview.sequences), 'sequence')}{splits}{size}")
@@ -54,7 +55,7 @@ def _print(overview: Overview) -> None:
             "Classes",
             "Size",
         )
-        print_table(out, header, [_row(sequence) for sequence in overview.sequences], turn=False)
+        print_table(header, [_row(sequence) for sequence in overview.sequences], turn=False)
     for sequence in overview.sequences:
         if sequence.problem:
             show(f"{sequence.path or sequence.name}: {sequence.problem}")
@@ -70,7 +71,7 @@ def _print(overview: Overview) -> None:
             "Frames",
             "Made",
         )
-        print_table(out, header, [_grid_row(grids) for grids in kinds])
+        print_table(header, [_grid_row(grids) for grids in kinds])
     for capture in overview.captures:
         span = f"{capture.first}..{capture.last}" + (
             f" with {count(capture.gaps, 'gap')}" if capture.gaps else ""
@@ -79,21 +80,21 @@ def _print(overview: Overview) -> None:
         show(f"raw capture {capture.path or '.'}: {size} ({span})")
 
 
-def _row(sequence: SequenceOverview) -> list[str]:
+def _row(sequence: SequenceOverview) -> list[object]:
     fields = [
         name if n == sequence.frames else f"{name} ({n})" for name, n in sequence.fields.items()
     ]
     fields += [name.removesuffix(".txt") for name in sequence.documents if name.endswith(".txt")]
     return [
         sequence.path or sequence.name,
-        str(sequence.frames),
-        "" if sequence.first is None else f"{sequence.first}..{sequence.last}",
-        str(sequence.gaps or ""),
+        sequence.frames,
+        None if sequence.first is None else f"{sequence.first}..{sequence.last}",
+        sequence.gaps or None,
         ", ".join(fields) or "none",
         ", ".join(grid.name for grid in sequence.grids) or "none",
         sequence.axes,
         sequence.classes,
-        "" if sequence.bytes is None else f"about {_size(sequence.bytes)}",
+        None if sequence.bytes is None else f"about {_size(sequence.bytes)}",
     ]
 
 
@@ -107,7 +108,7 @@ def _kinds_of_grids(overview: Overview) -> list[list[GridOverview]]:
     return list(kinds.values())
 
 
-def _grid_row(grids: list[GridOverview]) -> list[str]:
+def _grid_row(grids: list[GridOverview]) -> list[object]:
     grid = grids[0]
     return [
         grid.name,
@@ -116,8 +117,8 @@ def _grid_row(grids: list[GridOverview]) -> list[str]:
         " x ".join(f"{edge:.4g}" for edge in grid.voxel_size),
         ", ".join(f"{low:g}..{up:g}" for low, up in zip(grid.lower, grid.upper, strict=True)),
         ", ".join(grid.parts),
-        str(len(grids)),
-        str(sum(g.frames for g in grids)),
+        len(grids),
+        sum(g.frames for g in grids),
         _made(grid),
     ]
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Annotated
 
 import carlasc
-from carlasc.cli.common import Json, console, echo, line, place_argument, print_json
+from carlasc.cli.common import Json, echo, place_argument, print_json
 from carlasc.cli.flags import RunFlags
 from carlasc.cli.library import Given, Library
-from carlasc.errors import count
+from carlasc.errors import count, first_names
 
 
 def pack(
@@ -37,25 +37,27 @@ def pack(
 
 
 def _print(result: carlasc.storage.packing.PackResult) -> None:
-    from rich.table import Table
+    from carlasc.cli.tables import print_table
 
     echo(
         f"{result.out}: {count(len(result.sequences), 'sequence')}, {count(result.frames, 'frame')}"
     )
-    table = Table()
-    for heading in ("field", "published bytes", "packed bytes", "share"):
-        table.add_column(heading, justify="left" if heading == "field" else "right")
-    for name in sorted({*result.published_bytes, *result.stored_bytes}):
-        before, after = result.published_bytes.get(name, 0), result.stored_bytes.get(name, 0)
-        table.add_row(
-            line(name), f"{before:,}", f"{after:,}", f"{after / before:.1%}" if before else ""
-        )
-    before, after = sum(result.published_bytes.values()), sum(result.stored_bytes.values())
-    table.add_row("total", f"{before:,}", f"{after:,}", f"{result.ratio:.1%}", style="bold")
-    console().print(table)
+    published, stored = result.published_bytes, result.stored_bytes
+    rows = [
+        (name, published.get(name, 0), stored.get(name, 0))
+        for name in sorted({*published, *stored})
+    ]
+    rows.append(("total", sum(published.values()), sum(stored.values())))
+    print_table(
+        ("field", "published bytes", "packed bytes", "share"),
+        [
+            (name, f"{before:,}", f"{after:,}", f"{after / before:.1%}" if before else None)
+            for name, before, after in rows
+        ],
+        turn=False,
+    )
     if result.left_out:
-        more = f" and {len(result.left_out) - 5} more" if len(result.left_out) > 5 else ""
         echo(
-            f"left out, because they are not part of CarlaSC's layout: "
-            f"{', '.join(result.left_out[:5])}{more}"
+            "left out, because they are not part of CarlaSC's layout: "
+            f"{first_names(result.left_out, 5)}"
         )

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 import carlasc
-from carlasc.cli.common import Json, echo, file_option, places_argument, print_json
+from carlasc.cli.common import Json, echo, file_option, place_argument, print_json, read_places
 from carlasc.cli.flags import WorkFlags
 from carlasc.cli.library import Given, Library
 from carlasc.cli.view import SceneGiven, describe_frames
@@ -19,9 +19,11 @@ def render(
     *,
     sources: Annotated[
         list[str],
-        places_argument(
+        place_argument(
             "A sequence or data set (folder, zip, packed store, URL), the folder of a grid, or the "
             "file of one frame. With --grid-of: one or more.",
+            "SOURCES",
+            read=read_places,
         ),
     ],
     out: Annotated[

@@ -10,7 +10,6 @@ import typer
 from carlasc.cli.common import (
     Json,
     SourceArgument,
-    console,
     echo,
     file_option,
     print_json,
@@ -88,19 +87,18 @@ def _print_actors(actors: tuple[ActorTrack, ...], *, everything: bool) -> None:
     rows = [
         [
             actor.label,
-            str(actor.instance or ""),
+            actor.instance or None,
             f"{actor.first}..{actor.last}",
-            str(actor.observations),
-            str(actor.points),
+            actor.observations,
+            actor.points,
             f"{actor.speed_m_s:.1f}",
             " x ".join(f"{side:.1f}" for side in actor.size_m),
-            "" if actor.residual_m is None else f"{actor.residual_m:.2f}",
-            "" if actor.residual_static_m is None else f"{actor.residual_static_m:.2f}",
+            actor.residual_m,
+            actor.residual_static_m,
             f"{actor.confidence:.0%}",
         ]
         for actor in shown
     ]
-    out = console()
-    print_table(out, header, rows, turn=False)
+    print_table(header, rows, turn=False)
     if len(actors) > len(shown):
-        out.print(f"... and {len(actors) - len(shown)} more (--all prints them)", highlight=False)
+        show(f"... and {len(actors) - len(shown)} more (--all prints them)")

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from carlasc.cli.common import Overwrite, console, echo
+from carlasc.cli.common import Overwrite, echo
 from carlasc.cli.library import Given, Library
 
 
@@ -38,7 +38,7 @@ def scores(
         from carlasc.cli.tables import print_table
 
         figures = table.table()
-        print_table(console(), figures.header, figures.texts(), title=figures.title)
+        print_table(figures.header, figures.texts(), title=figures.title)
         return
     text = table.table().to_csv() if plain else getattr(table, f"to_{format}")()
     if out is None:

@@ -9,7 +9,7 @@ import typer
 
 import carlasc
 from carlasc.cli.capture import CamerasOption, OutArgument, SensorFlags, camera_names
-from carlasc.cli.common import Json, console, print_frames, print_json
+from carlasc.cli.common import Json, print_frames, print_json, show
 from carlasc.cli.flags import RunFlags
 from carlasc.cli.grid_flags import GridFlags
 from carlasc.errors import count as count_of  # `count` is an option
@@ -56,20 +56,18 @@ def simulate(
 
 
 def _print_capture(result: carlasc.captures.SimulationResult) -> None:
-    from rich.table import Table
+    from carlasc.cli.tables import print_table
 
-    table = Table(
-        "class",
-        "points",
-        "share",
-        title=f"{result.out}: {count_of(result.count, 'frame')} of "
-        f"{count_of(result.sensors, 'sensor')}",
-    )
+    frames, sensors = count_of(result.count, "frame"), count_of(result.sensors, "sensor")
     total = sum(result.classes.values())
-    for name, points_of_class in sorted(result.classes.items(), key=lambda item: -item[1]):
-        table.add_row(name, f"{points_of_class:,}", f"{points_of_class / total:.2%}")
-    console().print(table)
-    console().print(
-        f"{count_of(result.written, 'frame')} written, {result.count - result.written} existed "
-        f"already"
+    print_table(
+        ("class", "points", "share"),
+        [
+            (name, f"{points:,}", f"{points / total:.2%}")
+            for name, points in sorted(result.classes.items(), key=lambda item: -item[1])
+        ],
+        title=f"{result.out}: {frames} of {sensors}",
+        turn=False,
     )
+    written = count_of(result.written, "frame")
+    show(f"{written} written, {result.count - result.written} existed already")

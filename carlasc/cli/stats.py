@@ -10,7 +10,6 @@ import typer
 from carlasc.cli.common import (
     Json,
     SourceArgument,
-    console,
     echo,
     file_option,
     print_json,
@@ -76,18 +75,17 @@ def print_statistics(result: Statistics, by: str = "split") -> None:
     """Print the class tables; `carlasc demo` uses it too."""
     from carlasc.cli.tables import print_table
 
-    out = console()
     splits = result.by_split() if by == "split" else {}
     if set(splits) == {"none"}:
         splits = {}
     for remapped in (False, True) if result.remap else (False,):
         classes = result.remap.target if remapped and result.remap else result.classes
         header, rows = _class_table(result, classes, splits, remapped=remapped)
-        print_table(out, header, rows, title=f"Classes of {classes.name}", turn=False)
+        print_table(header, rows, title=f"Classes of {classes.name}", turn=False)
     if by == "sequence":
         for kind in _KINDS:
             header, rows = _sequence_table(result, kind)
-            print_table(out, header, rows, title=f"{kind}, % by sequence")
+            print_table(header, rows, title=f"{kind}, % by sequence")
     total = result.total
     if total.grids:
         show(f"{total.known_share:.1%} of voxels known ({count(total.grids, 'grid')})")
@@ -102,7 +100,7 @@ def print_statistics(result: Statistics, by: str = "split") -> None:
 
 def _class_table(
     result: Statistics, classes: ClassTable, splits: dict[str, Histogram], *, remapped: bool
-) -> tuple[list[str], list[list[str]]]:
+) -> tuple[list[str], list[list[object]]]:
     """Return a header and a row per class: its counts, its shares in the whole and in each split,
     its weight.
     """
@@ -116,7 +114,7 @@ def _class_table(
     ]
     weights = result.weights() if remapped or result.remap is None else {}
     header += ["weight"] if weights else []
-    rows = []
+    rows = list[list[object]]()
     for name in classes.names.values():
         if any(counts[name] for counts in totals):
             cells = [
@@ -127,10 +125,10 @@ def _class_table(
     return header, rows
 
 
-def _sequence_table(result: Statistics, kind: Kind) -> tuple[list[str], list[list[str]]]:
+def _sequence_table(result: Statistics, kind: Kind) -> tuple[list[str], list[list[object]]]:
     """Return a header and a row per sequence: the share of each class."""
     names = list(_counts(result, result.total, kind, remapped=True))
-    rows = []
+    rows = list[list[object]]()
     for path, histogram in result.sequences.items():
         counts = _counts(result, histogram, kind, remapped=True)
         rows.append([path or result.location, *(_percent(counts, name) for name in names)])
@@ -141,6 +139,6 @@ def _counts(result: Statistics, histogram: Histogram, kind: Kind, remapped: bool
     return result.summed(histogram.of(kind)) if remapped else result.named(histogram.of(kind))
 
 
-def _percent(counts: dict[str, int], name: str) -> str:
+def _percent(counts: dict[str, int], name: str) -> float | None:
     total = sum(counts.values())
-    return f"{100 * counts[name] / total:.2f}" if total else ""
+    return 100 * counts[name] / total if total else None

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from carlasc.cli.common import console as stdout
 from carlasc.errors import printable
 
 _MOST_COLUMNS = 10  # a table with more columns beside the first is transposed
@@ -23,12 +24,12 @@ Column = tuple[str, ...]  # the header and the cells
 
 
 def print_table(
-    console: Console,
     header: Sequence[str],
-    rows: Sequence[Sequence[str]],
+    rows: Sequence[Sequence[object]],
     *,
     title: str = "",
     turn: bool = True,
+    console: Console | None = None,
 ) -> None:
     """Print a table whose first column holds the names of the rows.
 
@@ -37,29 +38,28 @@ def print_table(
     the first column.
 
     Args:
-        console: where to print; its width is that of the terminal.
         header: names of the columns.
-        rows: the cells of each row, as many as there are columns.
+        rows: the cells of each row, as many as there are columns. A number with a fraction gets two
+            decimals, and None is an empty cell.
         title: printed above the table.
         turn: whether the table may be transposed.
+        console: where to print, as wide as the terminal; None for stdout.
     """
+    console = console or stdout()
     title, header = printable(title), [printable(name) for name in header]
-    rows = [[printable(cell) for cell in row] for row in rows]  # names come from data
-    columns: list[Column] = list(zip(header, *rows, strict=True))
+    texts = [list(map(_text, row)) for row in rows]
+    columns: list[Column] = list(zip(header, *texts, strict=True))
     if (
         turn
-        and rows
+        and texts
         and (len(columns) - 1 > _MOST_COLUMNS or _least_width(columns) > console.width)
     ):
         # paths are too long for a column
         names = [
             header[0],
-            *(row[0].replace("/", "/\n") for row in rows),
+            *(row[0].replace("/", "/\n") for row in texts),
         ]
-        columns = [
-            (name, *cells[1:])
-            for name, cells in zip(names, [tuple(header), *map(tuple, rows)], strict=True)
-        ]
+        columns = [(name, *cells[1:]) for name, cells in zip(names, [header, *texts], strict=True)]
     if title:  # rich would wrap it at the width of the table
         console.print(Text(title, style="italic"))
     for chosen in _split(columns, console.width):
@@ -72,6 +72,12 @@ def print_table(
         for cells in zip(*(column[1:] for column in chosen), strict=True):
             table.add_row(*map(Text, cells))
         console.print(table)
+
+
+def _text(cell: object) -> str:
+    if isinstance(cell, float):
+        return f"{cell:.2f}"
+    return "" if cell is None else printable(str(cell))  # names come from data
 
 
 def _split(columns: list[Column], width: int) -> Iterator[list[Column]]:

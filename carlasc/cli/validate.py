@@ -12,7 +12,6 @@ from carlasc.cli.common import (
     FAILED,
     Json,
     SourceArgument,
-    console,
     print_json,
     report_failures,
     show,
@@ -180,7 +179,6 @@ def print_held_out(result: HoldoutResult) -> None:
 def _print_scores(title: str, scores: HeldOutScores) -> None:
     from carlasc.cli.tables import print_table
 
-    out = console()
     header = [
         "Rays",
         "Returns",
@@ -190,12 +188,11 @@ def _print_scores(title: str, scores: HeldOutScores) -> None:
         "Passed %",
         "Passed objects %",
         "Missed %",
+        "Error m",
+        "90 % m",
     ]
-    header += ["Error m", "90 % m"]
     parts = {"all": scores.all, **scores.by_distance(), **scores.by_class()}
-    print_table(
-        out, header, [_row(name, shares) for name, shares in parts.items()], title=title, turn=False
-    )
+    print_table(header, [_row(name, one) for name, one in parts.items()], title=title, turn=False)
     if scores.swept_share is not None:
         show(
             f"{scores.swept_share:.2%} of the {scores.swept_voxels} voxels that the vehicle itself "
@@ -203,20 +200,8 @@ def _print_scores(title: str, scores: HeldOutScores) -> None:
         )
 
 
-def _row(name: str, shares: RayShares) -> list[str]:
-    percent = [
-        shares.free,
-        shares.unknown,
-        shares.occupied,
-        shares.passed,
-        shares.passed_object,
-        shares.missed,
-    ]
-    metres = [shares.error_median_m, shares.error_90_m]
-    cells = ["" if value is None else f"{100 * value:.2f}" for value in percent]
-    return [
-        name,
-        str(shares.returns),
-        *cells,
-        *("" if value is None else f"{value:.2f}" for value in metres),
-    ]
+def _row(name: str, shares: RayShares) -> list[object]:
+    where = shares.free, shares.unknown, shares.occupied
+    percent = *where, shares.passed, shares.passed_object, shares.missed
+    cells = [None if value is None else 100 * value for value in percent]
+    return [name, shares.returns, *cells, shares.error_median_m, shares.error_90_m]

@@ -1,22 +1,145 @@
-"""The clouds of a frame as one scan: in the frame of the layout, at one instant, with the origin of
-each ray.
+"""A frame as one scan: its clouds in the frame of the layout, at one instant, with the origin of
+each ray; and the classes and axes in which its fields are written.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
-from carlasc.converting.protocol import Cloud, FrameHandle, Sensor, Trajectory
+from carlasc.converting.protocol import Cloud, Converter, FrameHandle, Sensor, Trajectory
 from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, LabelArray, Uint32Array
-from carlasc.core.geometry import Transform, invert, transform_points
-from carlasc.errors import CarlascError, FormatError, describe
+from carlasc.core.choices import FlowSource as FlowSource  # noqa: PLC0414 (part of this module)
+from carlasc.core.choices import Images as Images  # noqa: PLC0414 (part of this module)
+from carlasc.core.classes import ClassTable, Remap
+from carlasc.core.geometry import Transform, invert, mirror_points, transform_points
+from carlasc.errors import (
+    ArgumentError,
+    CarlascError,
+    FormatError,
+    check_choice,
+    describe,
+    first_names,
+)
 from carlasc.motion.odometry import move_each, ticks_of
 from carlasc.storage import layout
+from carlasc.storage.metadata import Axes
 
 _APART_M = 0.25  # positions of a sensor within a sweep that are closer than this count as one
+_IDS = np.iinfo(np.uint16).max + 1
+_UNKNOWN = np.uint32(np.iinfo(np.uint32).max)
+
+
+@dataclass(frozen=True)
+class LayoutOptions:
+    """How a conversion writes sequences.
+
+    Attributes:
+        classes: classes of the labels. "carla": CarlaSC's classes. The name of the data set's own
+            class table, such as "semantickitti": its ids are kept. "auto": the ids of SemanticKITTI
+            are kept, because its tools need them, and all others become "carla".
+        axes: axes of the output. "left": y is mirrored, as in CarlaSC, which is left-handed.
+            "right": right-handed, as in the data set.
+        flow: scene flow. "auto": the velocity of each actor, from its tracked boxes, otherwise
+            estimated from the points of numbered actors. "none": no flow.
+        allow_unknown: treat class ids that the table does not have as unlabelled.
+        images: images of cameras. "copy": copied into the output. "link": only their paths are
+            written. "none": left out. The calibration of the cameras is always written.
+
+    Raises:
+        ArgumentError: an unknown value of `axes`, `flow` or `images`.
+    """
+
+    classes: str = "auto"
+    axes: Axes = "left"
+    flow: FlowSource = "auto"
+    allow_unknown: bool = False
+    images: Images = "none"
+
+    def __post_init__(self) -> None:
+        check_choice("axes", self.axes, Axes)
+        check_choice("images", self.images, Images)
+        check_choice("flow", self.flow, FlowSource)
+
+    def of(self, converter: Converter) -> AxesAndClasses:
+        """Return the axes and the classes in which the data of a converter are written.
+
+        Raises:
+            ArgumentError: `classes` is neither "auto", "carla" nor the name of the converter's
+                class table.
+        """
+        own = converter.classes.name
+        check_choice("classes", self.classes, ("auto", "carla", own))
+        usual = own if converter.keeps_classes else "carla"
+        if (usual if self.classes == "auto" else self.classes) == own:
+            return AxesAndClasses(converter.classes, None, self.axes == "left", self.allow_unknown)
+        if converter.to_carla is None:
+            raise ArgumentError(
+                "classes",
+                expected=f"{converter.classes.name}, because no map to CarlaSC's classes exists",
+                found="carla",
+            )
+        return AxesAndClasses(
+            converter.classes, converter.to_carla, self.axes == "left", self.allow_unknown
+        )
+
+
+@dataclass(frozen=True)
+class AxesAndClasses:
+    """The axes and the classes in which frames of a data set are written.
+
+    Attributes:
+        source: class table of the ids that are read.
+        remap: maps them to other ids; None keeps them.
+        mirrored: whether y is mirrored, from right-handed axes to CarlaSC's left-handed ones.
+        allow_unknown: whether ids that the table does not have become unlabelled.
+    """
+
+    source: ClassTable
+    remap: Remap | None
+    mirrored: bool
+    allow_unknown: bool = False
+
+    @property
+    def classes(self) -> ClassTable:
+        """Table of the ids that are written."""
+        return self.source if self.remap is None else self.remap.target
+
+    def map_labels(self, labels: LabelArray, where: str) -> Uint32Array:
+        """Return the ids that are written for the ids that were read.
+
+        Raises:
+            FormatError: an id is unknown; the message names it and its frequency. `where` names the
+                labels.
+        """
+        ids = self.source.names if self.remap is None else self.remap.mapping
+        lookup = _lookup_table(
+            tuple(ids), tuple(ids if self.remap is None else self.remap.mapping.values())
+        )
+        mapped = lookup[labels if labels.dtype.itemsize <= 2 else np.minimum(labels, _IDS - 1)]
+        if mapped.size and int(mapped.max()) == _UNKNOWN:
+            unknown = mapped == _UNKNOWN
+            if not self.allow_unknown:
+                counts = zip(*np.unique(labels[unknown], return_counts=True), strict=True)
+                raise FormatError(
+                    where,
+                    expected=f"class ids of {self.source.name}",
+                    found=first_names(f"{label} ({times} times)" for label, times in counts),
+                    advice="treat them as unlabelled with `allow_unknown=True`",
+                )
+            mapped[unknown] = 0
+        return mapped
+
+
+@lru_cache(maxsize=8)
+def _lookup_table(ids: tuple[int, ...], targets: tuple[int, ...]) -> Uint32Array:
+    """Return the target of every 16-bit id, `_UNKNOWN` where it has none."""
+    lookup = np.full(_IDS, _UNKNOWN, np.uint32)
+    lookup[list(ids)] = targets
+    return lookup
 
 
 @dataclass(frozen=True)
@@ -266,3 +389,27 @@ def _other(cloud: Cloud, name: str, rig: Rig, where: str) -> AnyArray:
         return values
     rotation = (invert(rig.vehicle_T_scan) @ rig.sensors[cloud.sensor].vehicle_T_points)[:3, :3]
     return (values @ rotation.T).astype(values.dtype)
+
+
+def make_fields(scan: Assembled, target: AxesAndClasses, where: str) -> dict[str, AnyArray]:
+    """Return the fields of a scan in the axes and classes of the target, points last: a frame that
+    has points is complete.
+
+    Args:
+        scan: the scan, right-handed, with class ids of the data set.
+        target: the axes and classes in which it is written.
+        where: the frame, for errors.
+
+    Raises:
+        FormatError: a class id is unknown.
+    """
+    fields: dict[str, AnyArray] = {}
+    if scan.labels is not None:
+        fields["labels"] = target.map_labels(scan.labels, f"labels of {where}")
+    if scan.instances is not None:
+        fields["instances"] = scan.instances
+    for name, array in scan.fields.items():
+        mirrored = target.mirrored and layout.field_named(name).kind == "vector"
+        fields[name] = mirror_points(array) if mirrored else array
+    fields["points"] = mirror_points(scan.points) if target.mirrored else scan.points
+    return fields

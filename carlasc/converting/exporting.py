@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Collection, Generator, Mapping, Sequence
+from collections.abc import Collection, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
@@ -19,8 +19,8 @@ from carlasc.converting.exporter import (
     SequenceExporter,
     SequenceFile,
 )
+from carlasc.converting.protocol import Failure, check_outside
 from carlasc.converting.registry import load_exporter, read_options
-from carlasc.converting.results import ExportResult, Failure, check_outside
 from carlasc.core.arrays import AnyArray
 from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError, StorageError
 from carlasc.running.processes import one_pool, run_all
@@ -39,6 +39,30 @@ from carlasc.storage.files import (
 
 RECORD = "carlasc-export.json"
 """The file in a folder that records its exports."""
+
+
+@dataclass(frozen=True)
+class ExportResult:
+    """The result of `export`.
+
+    Attributes:
+        out: root of the data set that was written.
+        sequences: the folder of each sequence in it, or its file where a format has one, by the
+            sequence's path in the source.
+        made: number of frames that were written.
+        skipped: number of frames that existed already.
+        failures: frames that could not be written.
+        notes: remarks about the result, one line each.
+        elapsed_s: duration in seconds.
+    """
+
+    out: Path
+    sequences: dict[str, str]
+    made: int
+    skipped: int
+    failures: tuple[Failure, ...]
+    notes: tuple[str, ...]
+    elapsed_s: float
 
 
 def export(
@@ -245,12 +269,8 @@ class _SequenceExport:
         """Export the frames of a sequence."""
         sequence, folder = exported.sequence, self.root / exported.folder
         remove_stale(folder)
-        write_many(
-            {
-                folder / document: data
-                for document, data in self.exporter.documents(sequence).items()
-            }
-        )
+        documents = self.exporter.documents(sequence)
+        write_many({folder / document: data for document, data in documents.items()})
         write = self._write_frames if isinstance(self.exporter, FrameExporter) else self._write_file
         failures = write(exported, folder)
         self.failures += [
@@ -273,7 +293,7 @@ class _SequenceExport:
         ]
         self._skip(len(exported.frames) - len(jobs))
         failures = {}
-        with closing(self._made(_write_frame, jobs)) as results:
+        with closing(self._made(jobs)) as results:
             for job, problem in zip(jobs, results, strict=True):
                 if problem is not None:
                     failures[job.frame] = problem
@@ -299,7 +319,7 @@ class _SequenceExport:
             make_folder(path.parent)
             part.unlink(missing_ok=True)  # of a run that was killed
             with (
-                closing(self._made(_make_frame, jobs)) as results,
+                closing(self._made(jobs)) as results,
                 exporter.open(part, sequence) as file,
             ):
                 for frame, made in zip(exported.frames, results, strict=True):
@@ -322,19 +342,21 @@ class _SequenceExport:
         self.skipped += frames
         self.steps(frames)
 
-    def _made(
-        self, function: Callable[[ExportJob], Any], jobs: list[ExportJob]
-    ) -> Generator[Any, None, None]:
+    def _made(self, jobs: list[ExportJob]) -> Generator[Any, None, None]:
         """Return the results of jobs: the arrays of a frame, or a message if the frame or its
         worker failed.
         """
-        return run_all(function, jobs, self.run, lost=lambda job, message: message)
+        return run_all(_make_frame, jobs, self.run, lost=lambda job, message: message)
 
 
-def _write_frame(job: ExportJob) -> str | None:
-    """Write one frame's files; return the error message if it cannot be done."""
-    assert isinstance(job.exporter, FrameExporter)
+def _make_frame(job: ExportJob) -> Mapping[str, AnyArray] | str | None:
+    """Make a frame, and write its files if it has files of its own; otherwise return its arrays.
+
+    If it cannot be done, return the error message.
+    """
     try:
+        if isinstance(job.exporter, SequenceExporter):
+            return job.exporter.make_frame(job.sequence, job.frame)
         files = job.exporter.make_frame(job.sequence, job.frame)
         write_many({job.folder / file: data for file, data in files.items()})
     except StorageError:
@@ -342,15 +364,6 @@ def _write_frame(job: ExportJob) -> str | None:
     except (CarlascError, OSError) as error:
         return str(error)
     return None
-
-
-def _make_frame(job: ExportJob) -> Mapping[str, AnyArray] | str:
-    """Return the arrays of a frame, or the error message if it cannot be done."""
-    assert isinstance(job.exporter, SequenceExporter)
-    try:
-        return job.exporter.make_frame(job.sequence, job.frame)
-    except (CarlascError, OSError) as error:
-        return str(error)
 
 
 def _add(file: SequenceFile, frame: int, content: Mapping[str, AnyArray]) -> str | None:

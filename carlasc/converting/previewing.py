@@ -11,10 +11,16 @@ from typing import Any
 import numpy as np
 
 from carlasc.converting.assembling import Rig, read_scan
-from carlasc.converting.plans import SplitName, choose_recordings
+from carlasc.converting.plans import (
+    FILE,
+    KISS_ICP,
+    SplitName,
+    choose_recordings,
+    frame_times,
+    read_trajectory,
+)
 from carlasc.converting.protocol import Converter, Recording
 from carlasc.converting.registry import find_recordings, open_converter
-from carlasc.converting.trajectory import FILE, KISS_ICP, frame_times, read_trajectory
 from carlasc.core.arrays import Float32Array
 from carlasc.groundtruth.heights import find_ground
 from carlasc.motion.options import PoseOptions

@@ -38,7 +38,7 @@ from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.frames import check_seconds
 from carlasc.core.geometry import Transform, check_rigid, slerp
 from carlasc.core.grids import GridSpec
-from carlasc.errors import FormatError
+from carlasc.errors import ConflictError, FormatError
 
 Split = Literal["Train", "Val", "Test"]
 
@@ -355,3 +355,35 @@ class Converter(ABC):
         Raises:
             MissingDataError: none exists; the message names the expected files.
         """
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A frame that could not be converted or exported.
+
+    Attributes:
+        sequence: location of its sequence in the source.
+        frame: its number.
+        message: the error, in one line.
+    """
+
+    sequence: str
+    frame: int
+    message: str
+
+
+def check_outside(out: Path, source: str) -> None:
+    """Check that a folder to write to is neither the source nor inside it.
+
+    A URL is never the same place.
+
+    Raises:
+        ConflictError: the folder is the source, or inside it.
+    """
+    if out.resolve().is_relative_to(Path(source).resolve()):
+        raise ConflictError(
+            out,
+            expected=f"a place outside {source}",
+            found="one inside it",
+            advice="choose another place, because the source is never written to",
+        )

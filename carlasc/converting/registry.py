@@ -204,15 +204,11 @@ def option_declarations(kind: type[Converter] | type[Exporter]) -> tuple[OptionD
         raise DependencyError(
             f"{kind.__name__}: options", problem=f"annotations cannot be read: {error}"
         ) from error
-    parameters = [
-        parameter
-        for parameter in list(inspect.signature(kind).parameters.values())[
-            issubclass(kind, Converter) :
-        ]
-        if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
-    ]
+    _, *parameters = inspect.signature(kind.__init__).parameters.values()  # without `self`
     return tuple(
-        _declared(kind, parameter, hints.get(parameter.name, str)) for parameter in parameters
+        _declared(kind, parameter, hints.get(parameter.name, str))
+        for parameter in parameters[issubclass(kind, Converter) :]
+        if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
     )
 
 
@@ -230,10 +226,7 @@ def read_options(
         ArgumentError: an option does not exist, or cannot have that value.
         DependencyError: a declaration is not valid.
     """
-    options, known = (
-        options or {},
-        {declared.name: declared for declared in option_declarations(kind)},
-    )
+    options, known = options or {}, {one.name: one for one in option_declarations(kind)}
     if unknown := sorted(set(options) - set(known)):
         expected = f"one of {', '.join(known)}" if known else "no options for this data set"
         raise ArgumentError("options", expected=expected, found=", ".join(unknown))

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.arrays import BoolArray, IntArray, LabelArray
-from carlasc.core.axes import mirror_grid, mirror_spec
-from carlasc.core.grids import GridSpec, most_frequent
+from carlasc.core.grids import GridSpec, mirror_grid, mirror_spec, most_frequent
 from carlasc.storage.metadata import Axes
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)

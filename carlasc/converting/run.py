@@ -9,17 +9,16 @@ import time
 from collections.abc import Collection, Mapping
 from collections.abc import Sequence as Series
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from carlasc.converting.layout_options import LayoutOptions
+from carlasc.converting.assembling import LayoutOptions
 from carlasc.converting.plans import SplitName, choose_recordings, plan_recording, sequence_path
-from carlasc.converting.protocol import Converter, Recording
+from carlasc.converting.protocol import Converter, Failure, Recording, check_outside
 from carlasc.converting.registry import find_recordings, open_converter
-from carlasc.converting.results import ConvertResult, Failure, check_outside
 from carlasc.converting.stages import Conversion
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError, check_choice
@@ -40,6 +39,29 @@ _LOOKED_AT = (
     3  # number of sequences, and of scans of each, in which points outside of the grid are counted
 )
 _MANY = 0.05  # share of the points between the sides of a grid: more points above it give a note
+
+
+@dataclass(frozen=True)
+class ConvertResult:
+    """The result of `convert`.
+
+    Attributes:
+        sequences: locations of the sequences that were written.
+        made: number of frames that were converted.
+        skipped: number of frames that existed before.
+        failures: frames that could not be converted, or whose grid could not be made.
+        grids: locations of the grids that were made from scans.
+        notes: remarks about the result, one line each.
+        elapsed_s: duration in seconds.
+    """
+
+    sequences: tuple[str, ...]
+    made: int
+    skipped: int
+    failures: tuple[Failure, ...]
+    grids: tuple[str, ...]
+    notes: tuple[str, ...]
+    elapsed_s: float
 
 
 def convert(
@@ -116,12 +138,8 @@ def convert(
     ]
     origin = f"{name if isinstance(name, str) else name.__name__} {root.name}"
     ranges = converter.min_range_m, converter.max_range_m
-    said = {
-        "license": converter.license,
-        "citation": converter.citation,
-        "simulated": converter.simulated or None,
-    }
-    known = {key: value for key, value in said.items() if value is not None}
+    said = {name: getattr(converter, name) for name in ("license", "citation", "simulated")}
+    known = {key: value for key, value in said.items() if value not in (None, False)}
     metadata = Metadata(layout.axes, target.classes, converter.sensor, *ranges, origin, known)
 
     steps = StepCounter(run.progress, sum(len(plan.recording.frames) for plan in plans))
@@ -149,9 +167,7 @@ def convert(
     failures = [failure for conversion in conversions for failure in conversion.failures]
     notes = [note for conversion in conversions for note in conversion.notes]
     if made is not None:
-        failures += [
-            Failure(failure.sequence, failure.frame, failure.message) for failure in made.failures
-        ]
+        failures += [Failure(one.sequence, one.frame, one.message) for one in made.failures]
         notes += made.notes
     return ConvertResult(
         tuple(sink.place(sequence_path(recording)) for recording in recordings),
@@ -239,10 +255,8 @@ def _what_is_cut(spec: GridSpec, source: Source) -> list[str]:
         for frame in frames[:: max(len(frames) // _LOOKED_AT, 1)][:_LOOKED_AT]:
             axes = spec.to_axes(sequence.read("points", int(frame))[:, :3])
             heights = axes[((axes >= spec.lower) & (axes < spec.upper))[:, :2].all(axis=1), 2]
-            within, above = (
-                within + len(heights),
-                above + int(np.count_nonzero(heights >= spec.upper[2])),
-            )
+            within += len(heights)
+            above += int(np.count_nonzero(heights >= spec.upper[2]))
     if above <= _MANY * within:
         return []
     return [
@@ -256,14 +270,10 @@ def _deal(recordings: Series[Recording], part: Part) -> list[Recording]:
     """Return the recordings of a part: those with their middle frame in its share of all frames."""
     if part.count == 1:
         return list(recordings)
-    ends = np.cumsum([len(recording.frames) for recording in recordings])
-    middles = ends - np.array([len(recording.frames) for recording in recordings]) / 2
-    shares = np.minimum(middles * part.count // max(ends[-1], 1), part.count - 1)
-    return [
-        recording
-        for recording, share in zip(recordings, shares, strict=True)
-        if share == part.number - 1
-    ]
+    frames = np.array([len(recording.frames) for recording in recordings])
+    middles = np.cumsum(frames) - frames / 2
+    shares = np.minimum(middles * part.count // max(frames.sum(), 1), part.count - 1)
+    return [recordings[index] for index in np.flatnonzero(shares == part.number - 1).tolist()]
 
 
 def _check(source: Path, sink: Sink, split: str, grids: Grids, part: Part) -> None:

@@ -1,50 +1,231 @@
 """The stages of the conversion of one recording: its scans are read once and written, then labels,
 boxes and flow from the motion of actors are added, and its cameras are written.
+
+A worker converts several frames in one task.
 """
 
 from __future__ import annotations
 
 from bisect import bisect
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from itertools import groupby
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
-from carlasc.converting.actors import ActorMotion, Velocity
-from carlasc.converting.frame_stages import (
-    ConvertedFrame,
-    MotionBlock,
+from carlasc.converting.actors import (
+    ActorMotion,
+    ActorObservation,
+    Fields,
     MotionJob,
-    ScanBlock,
-    ScanJob,
-    StageBlock,
-    in_blocks,
-    write_frames,
+    MotionStage,
+    Velocity,
+    find_actors,
 )
-from carlasc.converting.layout_options import AxesAndClasses, Images
-from carlasc.converting.plans import RecordingPlan, begin, write_heights, write_poses
-from carlasc.converting.protocol import Converter, FrameHandle
-from carlasc.converting.results import Failure
-from carlasc.converting.trajectory import estimate_poses, fill_gaps, odometry_range
-from carlasc.core.arrays import Float32Array, FloatArray
+from carlasc.converting.assembling import (
+    AxesAndClasses,
+    Images,
+    Rig,
+    VehicleMotion,
+    make_fields,
+    read_scan,
+)
+from carlasc.converting.plans import (
+    RecordingPlan,
+    begin,
+    estimate_poses,
+    fill_gaps,
+    follow,
+    write_heights,
+    write_poses,
+)
+from carlasc.converting.protocol import Converter, Failure, FrameHandle
+from carlasc.core.arrays import AnyArray, Float32Array, FloatArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import invert
+from carlasc.core.grids import GridSpec, mirror_grid
+from carlasc.errors import CarlascError, StorageError
 from carlasc.groundtruth.heights import Ground, find_ground
 from carlasc.motion import Track, tracks_from_boxes
+from carlasc.motion.odometry import UsableScan, usable_points
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.camera_files import cameras_to_json
 from carlasc.storage.metadata import Metadata
+from carlasc.storage.sinks import SequenceWriter
+
+VOXEL_FILES = "voxels_kitti"
+"""Folder of a sequence with the unchanged voxel files of the other data set, so that an export can
+write them again.
+"""
 
 _GROUND_FRAMES = 5  # scans in which the ground is looked for
 _NEAR_M = 250.0  # boxes farther away from the sensor hold no points
+_FRAMES = 8  # frames per task if each has its own files, because a task costs more than a frame
+
+
+@dataclass(frozen=True)
+class ScanJob:
+    """A frame to read.
+
+    Attributes:
+        handle: the frame.
+        motion: the motion of the vehicle around it, if known.
+        write: False if its scan exists already.
+    """
+
+    handle: FrameHandle
+    motion: VehicleMotion | None = None
+    write: bool = True
+
+
+@dataclass
+class ConvertedFrame:
+    """The result of a stage for one frame: its fields were written, or are still to be written, or
+    it failed.
+
+    Attributes:
+        number: frame number.
+        fields: its fields, until they are written.
+        failure: error message, if it failed.
+        points: (N, 3) float32 points to estimate poses from, right-handed, if they were requested.
+        actors: its numbered actors, if they were requested.
+        unnumbered: number of its moving points that belong to no numbered actor.
+    """
+
+    number: int
+    fields: Fields = field(default_factory=dict)
+    failure: str | None = None
+    points: Float32Array | None = None
+    actors: tuple[ActorObservation, ...] = ()
+    unnumbered: int = 0
+
+
+@dataclass(frozen=True)
+class ScanStage:
+    """Reads frames, in a worker.
+
+    Attributes:
+        target: the axes and classes of the output.
+        writer: the output.
+        rig: the sensors.
+        voxels: geometry of the frames' own voxel grids, right-handed, if they are written.
+        for_odometry: whether their points are returned, from which poses are estimated.
+        for_actors: whether their actors are returned, whose motion is estimated.
+    """
+
+    target: AxesAndClasses
+    writer: SequenceWriter
+    rig: Rig
+    voxels: GridSpec | None = None
+    for_odometry: bool = False
+    for_actors: bool = False
+
+    def make(self, job: ScanJob, frame: ConvertedFrame) -> Fields:
+        """Read a frame; return the fields of its scan and of its own voxel grid, and add other
+        requested data to the result.
+        """
+        fields: dict[str, AnyArray] = {}
+        if job.write or self.for_odometry or self.for_actors:
+            scan, classes = read_scan(job.handle, self.rig, job.motion), self.target.source
+            if self.for_odometry:
+                frame.points = scan.points[usable_points(scan.points), :3]
+            if self.for_actors and scan.labels is not None and scan.instances is not None:
+                frame.actors = find_actors(scan.points, scan.labels, scan.instances, classes)
+                moving = np.isin(scan.labels, sorted(classes.moving))
+                frame.unnumbered = int(np.count_nonzero(moving & (scan.instances == 0)))
+            if job.write:
+                fields = make_fields(scan, self.target, job.handle.location)
+        if self.voxels is not None:
+            fields |= self._voxel_fields(job.handle, self.voxels)
+        return fields
+
+    def _voxel_fields(self, handle: FrameHandle, spec: GridSpec) -> dict[str, AnyArray]:
+        """Return the fields of the frame's own voxel grid, and keep its files; empty if it has
+        none, or if it is written already.
+        """
+        grid = layout.grid_folder(spec)
+        written = self.writer.has(f"{grid}/counts", handle.number)
+        voxels = None if written else handle.read_voxels()
+        if voxels is None:
+            return {}
+        labels = self.target.map_labels(voxels.labels, f"voxels of {handle.location}")
+        # occupied, but its class has no target
+        known = voxels.known & ~((labels == 0) & (voxels.labels > 0))
+        labels[~known] = 0
+        for name, data in voxels.files.items():
+            self.writer.write_document(f"{VOXEL_FILES}/{name}", data)
+        counts = known.astype(np.float32)
+        if self.target.mirrored:
+            labels, counts = mirror_grid(labels), mirror_grid(counts)
+        return {f"{grid}/labels": labels, f"{grid}/counts": counts}
+
+
+@dataclass(frozen=True)
+class Block:
+    """Several frames that a worker converts in one task.
+
+    Attributes:
+        stage: makes the fields of each frame.
+        jobs: the frames: a `ScanJob` or a `MotionJob` each, as the stage takes them.
+    """
+
+    stage: ScanStage | MotionStage
+    jobs: tuple[Any, ...]
+
+    def convert(self) -> list[ConvertedFrame]:
+        """Convert the frames, and write them if the writer can be used in workers.
+
+        A frame that cannot be read has failed.
+
+        Raises:
+            StorageError: the output cannot be written, so that all other frames would fail, too.
+        """
+        frames = [ConvertedFrame(job.handle.number) for job in self.jobs]
+        for job, frame in zip(self.jobs, frames, strict=True):
+            try:
+                frame.fields = self.stage.make(job, frame)
+            except StorageError:
+                raise
+            except (CarlascError, OSError) as error:
+                frame.failure = str(error)
+        if self.stage.writer.concurrent:
+            write_frames(self.stage.writer, frames)
+        return frames
+
+    def fail(self, message: str) -> list[ConvertedFrame]:
+        """Return the frames of a block whose worker failed."""
+        return [ConvertedFrame(job.handle.number, failure=message) for job in self.jobs]
+
+
+def write_frames(writer: SequenceWriter, frames: Iterable[ConvertedFrame]) -> None:
+    """Write the fields of some frames, in the order of each frame, and drop them from memory."""
+    frames = list(frames)
+    if fields := {frame.number: frame.fields for frame in frames if frame.fields}:
+        writer.write_frames(fields)
+    for frame in frames:
+        frame.fields = {}
+
+
+def in_blocks(
+    handles: Sequence[FrameHandle], writer: SequenceWriter
+) -> Iterator[Sequence[FrameHandle]]:
+    """Yield frames, by increasing number, in blocks, one per task: those that the writer stores
+    together, otherwise a few successive ones.
+    """
+    if writer.block == 1:
+        yield from (handles[i : i + _FRAMES] for i in range(0, len(handles), _FRAMES))
+    else:
+        yield from (
+            list(block) for _, block in groupby(handles, lambda one: one.number // writer.block)
+        )
 
 
 @dataclass
@@ -128,14 +309,16 @@ class Conversion:
             if follow or estimate or handle.number in plan.missing or plan.voxels
         ]
         self.steps(len(plan.recording.frames) - len(chosen))
-        jobs = [
-            ScanJob(handle, plan.motion(handle), handle.number in plan.missing) for handle in chosen
-        ]
+        stage = ScanStage(self.target, plan.writer, plan.rig, plan.voxels, estimate, follow)
         blocks = [
-            ScanBlock(
-                tuple(part), self.target, plan.writer, plan.rig, plan.voxels, estimate, follow
+            Block(
+                stage,
+                tuple(
+                    ScanJob(handle, plan.motion(handle), handle.number in plan.missing)
+                    for handle in part
+                ),
             )
-            for part in in_blocks(jobs, lambda job: job.handle.number, plan.writer)
+            for part in in_blocks(chosen, plan.writer)
         ]
         actors = ActorMotion(self.converter.classes, self.run_options) if follow else None
         poses: dict[int, FloatArray] = {}
@@ -147,9 +330,7 @@ class Conversion:
                 self._unnumbered += result.unnumbered
         # otherwise, the failures are reported
         if estimate and len(self._failed) < len(plan.recording.frames):
-            plan.take_estimate(
-                fill_gaps(list(poses), np.array(list(poses.values())), plan.recording)
-            )
+            plan.take_estimate(fill_gaps(poses, plan.recording))
         return {} if actors is None else actors.finish()
 
     def _placed(
@@ -163,37 +344,32 @@ class Conversion:
             for result in usable:
                 yield result, self.plan.poses[result.number]
             return
-        from carlasc.motion.odometry import MIN_POINTS, follow_scans
+        waiting: dict[int, ConvertedFrame] = {}
 
-        waiting: deque[ConvertedFrame] = deque()
-        read_at: list[float] = []
-
-        def scans() -> Iterator[tuple[Float32Array, None]]:
+        def scans() -> Iterator[tuple[int, UsableScan]]:
             for result in usable:
-                if result.points is not None and len(result.points) >= MIN_POINTS:
+                if result.points is not None:
                     points, result.points = result.points, None
-                    waiting.append(result)
-                    read_at.append(float(self.plan.times[result.number]))
-                    yield points, None
+                    waiting[result.number] = result
+                    yield result.number, (points, None)
 
-        nearest, farthest = odometry_range(self.converter)
-        for pose in follow_scans(scans(), times=read_at, min_range_m=nearest, max_range_m=farthest):
-            yield waiting.popleft(), pose
+        for number, pose in follow(scans(), self.converter, self.plan.times):
+            yield waiting.pop(number), pose
 
-    def _work(self, blocks: Sequence[StageBlock[Any]]) -> Iterator[ConvertedFrame]:
+    def _work(self, blocks: Sequence[Block]) -> Iterator[ConvertedFrame]:
         """Yield the frames of blocks after their conversion; if workers cannot write them, they are
         written here.
         """
-        run = partial(run_all, StageBlock.convert, run=self.run_options)
+        run = partial(run_all, Block.convert, run=self.run_options)
 
-        def one_by_one(block: StageBlock[Any], message: str) -> list[ConvertedFrame]:
+        def one_by_one(block: Block, message: str) -> list[ConvertedFrame]:
             """Convert the frames of a lost block again, one by one, because one of them may have
             killed the workers.
             """
             if len(block.jobs) == 1 or self.plan.writer.block > 1:
                 return block.fail(message)
             singles = [replace(block, jobs=(job,)) for job in block.jobs]
-            return [frame for frames in run(singles, lost=StageBlock.fail) for frame in frames]
+            return [frame for frames in run(singles, lost=Block.fail) for frame in frames]
 
         with closing(run(blocks, lost=one_by_one)) as results:
             for frames in results:
@@ -219,23 +395,23 @@ class Conversion:
             return
         self.steps.expect(len(wanted))
         tracks, boxes = self._box_tracks()
-        blocks = []
-        for part in in_blocks(wanted, attrgetter("number"), plan.writer):
+        blocks, stage = [], MotionStage(self.target, plan.writer, plan.rig, plan.flow)
+        for part in in_blocks(wanted, plan.writer):
             near = None if tracks is None else _near(tracks, part, plan.poses)
             jobs = [
                 MotionJob(
                     handle,
                     plan.motion(handle),
+                    plan.poses[handle.number],
                     velocities.get(handle.number, {}),
                     near,
                     boxes.get(handle.number),
                     self._labelled_around(handle),
                     plan.recording.has_labels and handle.labelled,
-                    first_T_scan=plan.poses[handle.number],
                 )
                 for handle in part
             ]
-            blocks.append(MotionBlock(tuple(jobs), self.target, plan.writer, plan.rig, plan.flow))
+            blocks.append(Block(stage, tuple(jobs)))
         deque(self._work(blocks), maxlen=0)  # frames are written; nothing is kept
 
     def _labelled_around(self, handle: FrameHandle) -> tuple[MotionJob, ...]:
@@ -248,8 +424,7 @@ class Conversion:
         place = bisect(self._labelled, handle.number, key=attrgetter("number"))
         near = self._labelled[max(place - 1, 0) : place + 1]
         return tuple(
-            MotionJob(other, plan.motion(other), first_T_scan=plan.poses[other.number])
-            for other in near
+            MotionJob(other, plan.motion(other), plan.poses[other.number]) for other in near
         )
 
     @cached_property
@@ -275,11 +450,10 @@ class Conversion:
             )
             for number, own in plan.boxes.items()
         }
-        numbers = sorted({handle.number for handle in plan.recording.frames} | set(boxes))
+        poses = {number: plan.poses[number] for number in boxes}
+        numbers = sorted(poses.keys() | {handle.number for handle in plan.recording.frames})
         times = {number: float(plan.times[number]) for number in numbers}
-        return tracks_from_boxes(
-            boxes, {number: plan.poses[number] for number in boxes}, times
-        ), boxes
+        return tracks_from_boxes(boxes, poses, times), boxes
 
     def _find_ground(self) -> None:
         """Find the ground in some of the scans, and write the height of the sensor if the data set
@@ -300,15 +474,13 @@ class Conversion:
     def _remarks(self) -> list[str]:
         plan = self.plan
         notes = [*plan.recording.notes(), *plan.notes]
+        unlabelled = sum(not handle.labelled for handle in plan.recording.frames)
         if plan.boxes is not None and not plan.recording.has_labels:
             notes.append(
                 "points have no labels: points in boxes got the class of the box, others are "
                 "ground or have no class"
             )
-        elif plan.boxes is not None and not all(
-            handle.labelled for handle in plan.recording.frames
-        ):
-            unlabelled = sum(not handle.labelled for handle in plan.recording.frames)
+        elif plan.boxes is not None and unlabelled:
             notes.append(
                 f"{unlabelled} scans have no labels: their points got the class of the box that "
                 f"they are in, or of labelled points nearby"
@@ -323,10 +495,9 @@ class Conversion:
                 f"unknown and set to 0"
             )
         first, last = plan.recording.frames[0].number, plan.recording.frames[-1].number
-        if gaps := last - first + 1 - len(plan.recording.frames):
-            notes.append(
-                f"{gaps} of the {last - first + 1} frames from {first} to {last} have no scan"
-            )
+        every = last - first + 1
+        if gaps := every - len(plan.recording.frames):
+            notes.append(f"{gaps} of the {every} frames from {first} to {last} have no scan")
         return [f"{plan.writer.location}: {note}" for note in notes]
 
 
@@ -395,8 +566,5 @@ def _copy_images(plan: RecordingPlan, cameras: Sequence[CameraModel]) -> list[st
                 )
         if by_frame:
             plan.writer.write_frames(by_frame)
-    return (
-        [f"{missing} images of cameras do not exist, or are neither .jpg nor .png"]
-        if missing
-        else []
-    )
+    note = f"{missing} images of cameras do not exist, or are neither .jpg nor .png"
+    return [note] if missing else []

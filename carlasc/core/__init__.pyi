@@ -1,8 +1,3 @@
-from .axes import mirror_boxes as mirror_boxes
-from .axes import mirror_grid as mirror_grid
-from .axes import mirror_points as mirror_points
-from .axes import mirror_poses as mirror_poses
-from .axes import mirror_spec as mirror_spec
 from .benchmarks import IGNORED as IGNORED
 from .benchmarks import OCC3D as OCC3D
 from .benchmarks import OCC3D_TO_OPENOCCUPANCY as OCC3D_TO_OPENOCCUPANCY
@@ -13,6 +8,7 @@ from .benchmarks import TO_OCC3D as TO_OCC3D
 from .benchmarks import TO_SSCBENCH as TO_SSCBENCH
 from .boxes import BOXES_DTYPE as BOXES_DTYPE
 from .boxes import Boxes as Boxes
+from .boxes import mirror_boxes as mirror_boxes
 from .cameras import CameraModel as CameraModel
 from .classes import ClassTable as ClassTable
 from .classes import Color as Color
@@ -23,6 +19,8 @@ from .frames import Frames as Frames
 from .geometry import Transform as Transform
 from .geometry import check_rigid as check_rigid
 from .geometry import invert as invert
+from .geometry import mirror_points as mirror_points
+from .geometry import mirror_poses as mirror_poses
 from .geometry import quaternions_of as quaternions_of
 from .geometry import relative_to as relative_to
 from .geometry import rotate_vectors as rotate_vectors
@@ -35,6 +33,8 @@ from .grids import Coordinates as Coordinates
 from .grids import Grid as Grid
 from .grids import GridSpec as GridSpec
 from .grids import VoxelFlag as VoxelFlag
+from .grids import mirror_grid as mirror_grid
+from .grids import mirror_spec as mirror_spec
 from .scans import Scan as Scan
 from .scans import runs_of_origins as runs_of_origins
 from .scans import sorted_by_origin as sorted_by_origin

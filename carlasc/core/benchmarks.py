@@ -7,12 +7,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from carlasc.core.classes import ClassTable, Remap
+from carlasc.core.classes import ClassTable, Remap, color_of
 from carlasc.core.tables import (
     CARLA,
     SEMANTICKITTI,
     SEMANTICKITTI19,
-    color_of,
     id_map,
     lines_of,
     remap_named,

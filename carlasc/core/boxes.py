@@ -19,6 +19,7 @@ from carlasc.core.arrays import (
 from carlasc.core.geometry import (
     Transform,
     invert,
+    mirror_poses,
     poses_from,
     quaternions_of,
     transform_points,
@@ -199,14 +200,7 @@ class Boxes:
 
     def select(self, keep: BoolArray | AnyIntArray) -> Boxes:
         """Return the boxes that a mask of shape (N,) or indices of shape (M,) select."""
-        return Boxes(
-            self.tracks[keep],
-            self.labels[keep],
-            self.centers[keep],
-            self.quaternions[keep],
-            self.sizes[keep],
-            self.annotated[keep],
-        )
+        return Boxes(*(own[keep] for own in vars(self).values()))
 
     def joined(self, others: Boxes) -> Boxes:
         """Return the union of these boxes and others of the same frame.
@@ -258,3 +252,14 @@ class Boxes:
         for row in np.argsort(-np.prod(self.sizes, axis=1), kind="stable").tolist():
             owners[inside[row]] = row
         return owners
+
+
+def mirror_boxes(boxes: Boxes) -> Boxes:
+    """Mirror boxes.
+
+    The frame of each box is mirrored too, so that x is still along its length and the rotation is
+    proper.
+    """
+    return Boxes.from_poses(
+        boxes.tracks, boxes.labels, mirror_poses(boxes.sensor_T_box), boxes.sizes, boxes.annotated
+    )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, get_args
 
@@ -197,7 +197,7 @@ class CameraModel:
 
     def replaced(self, **changes: Any) -> CameraModel:
         """Return a copy with some attributes replaced."""
-        return CameraModel(**{name: getattr(self, name) for name in _KEYS} | changes)
+        return replace(self, **changes)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the camera as values for cameras.json."""

@@ -7,7 +7,7 @@ See the format page, `docs/format.md#classes` (CarlaSC, and the renumbering in C
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, Self
@@ -15,7 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from carlasc.core.arrays import AnyIntArray, FloatArray, Int32Array, LabelArray, Uint8Array
-from carlasc.errors import ArgumentError, FormatError
+from carlasc.errors import ArgumentError, FormatError, first_names
 
 Color = tuple[int, int, int]
 ROLES = ("moving", "movable", "deformable", "ground")
@@ -61,17 +61,20 @@ class ClassTable:
 
     def __post_init__(self) -> None:
         where = f"class table {self.name}"
-        if not self.names or min(self.names) < 0 or max(self.names) > _MAX_ID:
+        ids = set(self.names)
+        if not ids or min(ids) < 0 or max(ids) > _MAX_ID:
             raise ArgumentError(
-                where, expected=f"names of ids 0..{_MAX_ID}", found=str(sorted(self.names))
+                where, expected=f"names of ids 0..{_MAX_ID}", found=str(sorted(ids))
             )
-        if set(self.names) != set(self.colors):
-            without = sorted(set(self.names) ^ set(self.colors))
-            raise ArgumentError(
-                where,
-                expected="a name and a colour for each id",
-                found=f"only one of them for {_listed(without)}",
-            )
+        for expected, wrong in (
+            ("a name and a colour for each id", ids ^ set(self.colors)),
+            *((f"ids of the table in {role}", getattr(self, role) - ids) for role in ROLES),
+            ("an id of the table in geometry_only", {self.geometry_only} - ids - {None}),
+            ("an id of ground in ground_only", {self.ground_only} - self.ground - {None}),
+        ):
+            if wrong:
+                found = first_names(map(str, sorted(wrong)))
+                raise ArgumentError(where, expected=expected, found=f"not so for {found}")
         for index, color in self.colors.items():
             if len(color) != 3 or not all(0 <= value <= 255 for value in color):
                 raise ArgumentError(
@@ -79,19 +82,6 @@ class ClassTable:
                     expected="three values 0..255 for each colour",
                     found=f"{color} for {index}",
                 )
-        for role in ROLES:
-            if unknown := sorted(getattr(self, role) - set(self.names)):
-                raise ArgumentError(
-                    where, expected=f"ids of the table in {role}", found=_listed(unknown)
-                )
-        if self.geometry_only is not None and self.geometry_only not in self.names:
-            raise ArgumentError(
-                where, expected="an id of the table in geometry_only", found=str(self.geometry_only)
-            )
-        if self.ground_only is not None and self.ground_only not in self.ground:
-            raise ArgumentError(
-                where, expected="an id of ground in ground_only", found=str(self.ground_only)
-            )
         if self.num_channels and not max(self.names) < self.num_channels <= _MAX_ID + 1:
             expected = f"num_channels above {max(self.names)}, up to {_MAX_ID + 1}"
             raise ArgumentError(where, expected=expected, found=str(self.num_channels))
@@ -117,7 +107,7 @@ class ClassTable:
             return cls(
                 str(values["name"]),
                 {int(index): str(name) for index, name in values["names"].items()},
-                {int(index): _color(color) for index, color in values["colors"].items()},
+                {int(index): color_of(color) for index, color in values["colors"].items()},
                 **{role: frozenset(map(int, values.get(role, ()))) for role in ROLES},
                 geometry_only=_id_or_none(values.get("geometry_only")),
                 ground_only=_id_or_none(values.get("ground_only")),
@@ -331,10 +321,7 @@ def _id_or_none(value: Any) -> int | None:
     return None if value is None else int(value)
 
 
-def _color(values: Any) -> Color:
-    red, green, blue = (int(value) for value in values)
+def color_of(rgb: Iterable[Any]) -> Color:
+    """Return a colour from its red, green and blue, which may be texts."""
+    red, green, blue = map(int, rgb)
     return red, green, blue
-
-
-def _listed(ids: list[int]) -> str:
-    return ", ".join(map(str, ids[:8])) + (f" and {len(ids) - 8} more" if len(ids) > 8 else "")

@@ -1,16 +1,21 @@
-"""Rigid transforms.
+"""Rigid transforms, and the conversion between right-handed axes and those of CarlaSC.
 
 A transform named `dst_T_src` converts points from frame `src` to frame `dst`: `R @ p + t`.
+
+Right-handed axes (y to the left) and the left-handed axes of CarlaSC (y to the right) differ in the
+sign of y, so each function named `mirror_...` works in both directions.
 """
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from carlasc.core.arrays import AnyFloatArray, FloatArray
+from carlasc.core.arrays import AnyFloatArray, Float32Array, FloatArray
 from carlasc.errors import FormatError
 
 Floating = TypeVar("Floating", bound=np.floating[Any])
@@ -18,6 +23,8 @@ Floating = TypeVar("Floating", bound=np.floating[Any])
 Transform = FloatArray
 """(4, 4) float64, last row 0 0 0 1."""
 
+_SIGNS = np.array([1, -1, 1, 1], np.float32)
+_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 _FARTHEST_M = 1e9  # larger than any distance on Earth
 
 
@@ -220,45 +227,65 @@ def check_rigid(transforms: AnyFloatArray, name: str, tolerance: float = 1e-3) -
     poses = np.asarray(transforms, np.float64)
     if poses.shape[-2:] != (4, 4) or poses.ndim not in (2, 3):
         raise FormatError(name, expected="4 x 4 transforms", found=f"shape {poses.shape}")
-    if _are_rigid(poses.reshape(-1, 4, 4), tolerance):
-        return poses
-    # find the first one that is not valid, and the reason
-    for index, pose in enumerate(poses.reshape(-1, 4, 4)):
-        where = name if poses.ndim == 2 else f"{name}: transform {index}"
-        if not np.isfinite(pose).all():
-            raise FormatError(where, expected="finite numbers", found="NaN or infinity")
-        if np.abs(pose[:3, 3]).max() > _FARTHEST_M:
-            raise FormatError(
-                where,
-                expected=f"a position within {_FARTHEST_M:.0e} m",
-                found=f"{np.abs(pose[:3, 3]).max():g} m",
-            )
-        rotation = pose[:3, :3]
-        deviation = max(
-            np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(pose[3] - (0, 0, 0, 1)).max()
+    flat = poses.reshape(-1, 4, 4)
+    rotations, farthest = flat[:, :3, :3], np.abs(flat[:, :3, 3]).max(axis=1)
+    with np.errstate(invalid="ignore", over="ignore"):
+        deviation = np.maximum(
+            np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(axis=(1, 2)),
+            np.abs(flat[:, 3] - (0, 0, 0, 1)).max(axis=1),
         )
-        if deviation > tolerance:
-            raise FormatError(
-                where,
-                expected="a rigid transform",
-                found=f"a deviation of {deviation:.3g} from a rigid transform",
-                advice="the transform may be scaled or sheared, or may not be a pose",
-            )
-        if np.linalg.det(rotation) < 0:
-            raise FormatError(
-                where,
-                expected="a rotation",
-                found="a reflection (determinant -1)",
-                advice="the axes may be mirrored: check their handedness",
-            )
+        mirrored = np.linalg.det(rotations) < 0
+    checks: tuple[tuple[Any, str, str, str], ...] = (
+        (~np.isfinite(flat).all(axis=(1, 2)), "finite numbers", "NaN or infinity", ""),
+        (farthest > _FARTHEST_M, f"a position within {_FARTHEST_M:.0e} m", "{0:g} m", ""),
+        (
+            deviation > tolerance,
+            "a rigid transform",
+            "a deviation of {1:.3g} from a rigid transform",
+            "the transform may be scaled or sheared, or may not be a pose",
+        ),
+        (
+            mirrored,
+            "a rotation",
+            "a reflection (determinant -1)",
+            "the axes may be mirrored: check their handedness",
+        ),
+    )
+    wrong = np.any([mask for mask, *_ in checks], axis=0)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        expected, found, advice = next(parts for mask, *parts in checks if mask[row])
+        raise FormatError(
+            name if poses.ndim == 2 else f"{name}: transform {row}",
+            expected=expected,
+            found=found.format(farthest[row], deviation[row]),
+            advice=advice,
+        )
     return poses
 
 
-def _are_rigid(poses: FloatArray, tolerance: float) -> bool:
-    """Return whether all of (F, 4, 4) transforms are finite, rigid and proper."""
-    if not np.isfinite(poses).all() or np.abs(poses[:, :3, 3]).max(initial=0.0) > _FARTHEST_M:
-        return False
-    rotations = poses[:, :3, :3]
-    deviation = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(initial=0.0)
-    last = np.abs(poses[:, 3] - (0, 0, 0, 1)).max(initial=0.0)
-    return bool(max(deviation, last) <= tolerance and (np.linalg.det(rotations) >= 0).all())
+def mirror_points(points: Float32Array) -> Float32Array:
+    """Mirror (N, 3) or (N, 4) points or vectors. A fourth column is unchanged."""
+    return points * _SIGNS[: points.shape[1]]
+
+
+def mirror_poses(poses: FloatArray) -> FloatArray:
+    """Mirror (..., 4, 4) poses, in both the source and the destination frame."""
+    return _MIRROR @ poses @ _MIRROR
+
+
+def choices_of_axes() -> Iterator[tuple[str, FloatArray]]:
+    """Yield the 48 signed permutations of axes, the identity first: the new axes in terms of the
+    old ones, such as "-y, x, z", and the (3, 3) matrix.
+    """
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[range(3), order] = signs
+            yield (
+                ", ".join(
+                    f"{'-' if s < 0 else ''}{'xyz'[axis]}"
+                    for s, axis in zip(signs, order, strict=True)
+                ),
+                matrix,
+            )

@@ -8,12 +8,13 @@ points are Cartesian in both.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntFlag
-from typing import Any, cast
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from carlasc.core.arrays import (
     AnyArray,
@@ -31,6 +32,7 @@ from carlasc.core.choices import Preset
 from carlasc.core.notebook import describe
 from carlasc.errors import ArgumentError, FormatError, check_choice
 
+_Scalar = TypeVar("_Scalar", bound=np.generic)
 Triple = tuple[float, float, float]
 
 # a little above pi: an azimuth of exactly pi is inside the published bounds
@@ -65,10 +67,7 @@ class GridSpec:
     upper: Triple
 
     def __post_init__(self) -> None:
-        if self.coordinates not in ("cartesian", "cylindrical"):
-            raise ArgumentError(
-                "coordinates", expected="cartesian or cylindrical", found=f"{self.coordinates!r}"
-            )
+        check_choice("coordinates", self.coordinates, Coordinates)
         for name, kind in (("size", int), ("lower", float), ("upper", float)):
             values = tuple(kind(v) for v in getattr(self, name))
             if len(values) != 3 or not all(math.isfinite(v) for v in values):
@@ -76,10 +75,6 @@ class GridSpec:
                     f"grid {name}", expected="three finite numbers", found=str(getattr(self, name))
                 )
             object.__setattr__(self, name, values)
-        if min(self.size) < 1:
-            raise ArgumentError(
-                "grid size", expected="at least one cell per axis", found=str(self.size)
-            )
         if math.prod(self.size) >= 2**31:
             raise ArgumentError(
                 "grid size",
@@ -87,23 +82,26 @@ class GridSpec:
                 found=" x ".join(map(str, self.size)),
                 advice="use a coarser resolution",
             )
-        if any(low >= up for low, up in zip(self.lower, self.upper, strict=True)):
-            raise ArgumentError(
-                "grid bounds",
-                expected="lower < upper on every axis",
-                found=f"{self.lower} and {self.upper}",
-            )
-        if self.coordinates == "cylindrical":
-            if self.lower[0] < 0:
-                raise ArgumentError(
-                    "grid bounds", expected="a radius of 0 or more", found=f"{self.lower[0]}"
-                )
-            if self.upper[1] - self.lower[1] > 2 * _PI32:
-                raise ArgumentError(
-                    "grid bounds",
-                    expected="an azimuth range of at most 2 pi",
-                    found=f"{self.upper[1] - self.lower[1]} rad",
-                )
+        cylindrical, turn = self.coordinates == "cylindrical", self.upper[1] - self.lower[1]
+        bounds = f"{self.lower} and {self.upper}"
+        for wrong, name, expected, found in (
+            (min(self.size) < 1, "size", "at least one cell per axis", self.size),
+            (
+                np.any(np.greater_equal(self.lower, self.upper)),
+                "bounds",
+                "lower < upper on every axis",
+                bounds,
+            ),
+            (cylindrical and self.lower[0] < 0, "bounds", "a radius of 0 or more", self.lower[0]),
+            (
+                cylindrical and turn > 2 * _PI32,
+                "bounds",
+                "an azimuth range of at most 2 pi",
+                f"{turn} rad",
+            ),
+        ):
+            if wrong:
+                raise ArgumentError(f"grid {name}", expected=expected, found=str(found))
 
     @classmethod
     def published(cls, name: Preset | Coordinates = "coarse") -> GridSpec:
@@ -136,13 +134,8 @@ class GridSpec:
             size = [float(v) for v in params["grid_size"]]
             if any(v != int(v) for v in size):
                 raise FormatError(where, expected="integers in grid_size", found=str(size))
-            lower, upper = tuple(params["min_bound"]), tuple(params["max_bound"])
-            return cls(
-                params["coordinates"],
-                cast(tuple[int, int, int], tuple(int(v) for v in size)),
-                cast(Triple, lower),
-                cast(Triple, upper),
-            )
+            lower, upper = _three(params["min_bound"]), _three(params["max_bound"])
+            return cls(params["coordinates"], _three(map(int, size)), lower, upper)
         except FormatError:
             raise  # a FormatError is a ValueError
         except KeyError as error:
@@ -167,15 +160,11 @@ class GridSpec:
 
     def with_size(self, size: Sequence[int]) -> GridSpec:
         """Return a grid with the same bounds and `size` cells."""
-        return replace(self, size=cast(tuple[int, int, int], tuple(size)))
+        return replace(self, size=_three(size))
 
     def with_bounds(self, lower: Sequence[float], upper: Sequence[float]) -> GridSpec:
         """Return the grid with other bounds, rounded to float32 like the published bounds."""
-        return replace(
-            self,
-            lower=cast(Triple, tuple(_float32(v) for v in lower)),
-            upper=cast(Triple, tuple(_float32(v) for v in upper)),
-        )
+        return replace(self, lower=_three(map(_float32, lower)), upper=_three(map(_float32, upper)))
 
     def with_resolution(self, resolution: float | Sequence[float]) -> GridSpec:
         """Return a grid of cells of the given size that covers these bounds (the rule of `--res`).
@@ -220,12 +209,7 @@ class GridSpec:
                 centre = (self.lower[axis] + self.upper[axis]) / 2
                 lower[axis] = _float32(centre - cells * step / 2)
                 upper[axis] = _float32(centre + cells * step / 2)
-        return GridSpec(
-            self.coordinates,
-            cast(tuple[int, int, int], tuple(size)),
-            cast(Triple, tuple(lower)),
-            cast(Triple, tuple(upper)),
-        )
+        return GridSpec(self.coordinates, _three(size), _three(lower), _three(upper))
 
     @property
     def num_voxels(self) -> int:
@@ -392,10 +376,8 @@ class Grid:
         return np.ones(self.spec.size, np.bool_) if self.counts is None else self.counts > 0
 
     def __repr__(self) -> str:
-        occupied, free = (
-            np.count_nonzero(self.labels),
-            np.count_nonzero(self.known & (self.labels == 0)),
-        )
+        occupied = np.count_nonzero(self.labels)
+        free = np.count_nonzero(self.known & (self.labels == 0))
         return f"<Grid {self.spec}: {occupied:,} occupied and {free:,} free voxels>"
 
     def _repr_html_(self) -> str:
@@ -408,6 +390,11 @@ class Grid:
             "classes": np.unique(self.labels[self.labels > 0]).tolist(),
         }
         return describe(repr(self), rows, spec.seen_from_above(self.labels))
+
+
+def _three(values: Iterable[Any]) -> Any:
+    """Return the values of the axes as the fields of a `GridSpec`, which checks their number."""
+    return tuple(values)
 
 
 def _float32(value: float) -> float:
@@ -474,3 +461,23 @@ def is_confident(occupied: AnyFloatArray, min_confidence: float) -> BoolArray:
     p = np.asarray(occupied, np.float16)
     confident: BoolArray = np.maximum(p, 1 - p) >= np.float16(min_confidence)
     return confident
+
+
+def mirror_grid(grid: NDArray[_Scalar]) -> NDArray[_Scalar]:
+    """Mirror an (X, Y, Z) grid along its second axis: y (Cartesian) or azimuth (cylindrical)."""
+    mirrored: AnyArray = grid[:, ::-1]
+    return mirrored
+
+
+def mirror_spec(spec: GridSpec) -> GridSpec:
+    """Return the geometry of a mirrored grid: the bounds of y, or of the azimuth, are swapped and
+    negated.
+    """
+    (x0, y0, z0), (x1, y1, z1) = spec.lower, spec.upper
+    return GridSpec(spec.coordinates, spec.size, (x0, -y1, z0), (x1, -y0, z1))
+
+
+def mirror_voxels(grid: Grid) -> Grid:
+    """Mirror a grid with its geometry."""
+    counts = None if grid.counts is None else mirror_grid(grid.counts)
+    return Grid(mirror_spec(grid.spec), mirror_grid(grid.labels), counts)

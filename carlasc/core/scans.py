@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,8 @@ from carlasc.core.arrays import (
     Uint16Array,
     Uint32Array,
 )
-from carlasc.core.boxes import Boxes
-from carlasc.core.geometry import Transform, invert, transform_points, translation
+from carlasc.core.boxes import Boxes, mirror_boxes
+from carlasc.core.geometry import Transform, invert, mirror_points, transform_points, translation
 from carlasc.core.grids import GridSpec
 from carlasc.core.notebook import describe
 from carlasc.errors import FormatError, count
@@ -117,19 +117,13 @@ class Scan:
         """Return a scan with the points selected by an (N,) mask or (M,) indices, with all their
         fields. Boxes are kept.
         """
-
-        def chosen(values: AnyArray | None) -> AnyArray | None:
-            return None if values is None else values[keep]
-
-        return Scan(
-            self.points[keep],
-            chosen(self.labels),
-            chosen(self.flow),
-            chosen(self.instances),
-            chosen(self.remission),
-            {name: values[keep] for name, values in self.others.items()},
-            self.boxes,
-        )
+        others = {name: values[keep] for name, values in self.others.items()}
+        own = {
+            name: getattr(self, name)[keep]
+            for name in ("points", *self.fields())
+            if name not in others
+        }
+        return replace(self, others=others, **own)
 
 
 def sorted_by_origin(origins: AnyFloatArray) -> IntArray:
@@ -268,3 +262,16 @@ def check_finite(points: AnyFloatArray, name: str) -> None:
         raise FormatError(
             name, expected="finite coordinates", found=f"{points[row].tolist()} at point {row}"
         )
+
+
+def mirror_scan(scan: Scan) -> Scan:
+    """Mirror a scan: points, flow, ray origins and boxes."""
+    return replace(
+        scan,
+        points=mirror_points(scan.points),
+        flow=None if scan.flow is None else mirror_points(scan.flow),
+        others={
+            name: mirror_points(v) if name == "origins" else v for name, v in scan.others.items()
+        },
+        boxes=None if scan.boxes is None else mirror_boxes(scan.boxes),
+    )

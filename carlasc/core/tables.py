@@ -9,19 +9,13 @@ from typing import Any
 import numpy as np
 
 from carlasc.core.arrays import LabelArray
-from carlasc.core.classes import ClassTable, Color, Remap
+from carlasc.core.classes import ClassTable, Remap, color_of
 from carlasc.errors import ArgumentError, FormatError, check_choice
 
 
 def lines_of(table: str) -> list[list[str]]:
     """Return the words of each line of a table."""
     return [line.split() for line in table.strip().splitlines()]
-
-
-def color_of(rgb: list[str]) -> Color:
-    """Return a colour from the texts of its red, green and blue."""
-    red, green, blue = map(int, rgb)
-    return red, green, blue
 
 
 # name, colour, 11-class id; ids in order: docs/format.md#classes

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from carlasc.core.arrays import AnyFloatArray, AnyIntArray, Float32Array, IntArray
-from carlasc.core.axes import choices_of_axes
+from carlasc.core.geometry import choices_of_axes
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.groundtruth.reporting import ActorTrack
 from carlasc.inspection.findings import Finding

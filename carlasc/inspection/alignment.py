@@ -19,8 +19,7 @@ from typing import TypeAlias
 import numpy as np
 
 from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray
-from carlasc.core.axes import choices_of_axes
-from carlasc.core.geometry import Transform, invert, transform_points, translation
+from carlasc.core.geometry import Transform, choices_of_axes, invert, transform_points, translation
 from carlasc.inspection.pose_quality import PoseQuality, measure_poses
 from carlasc.inspection.structure import VOXEL_M, occupancy, overlap
 

@@ -21,12 +21,16 @@ from carlasc.core.arrays import Float32Array
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import FolderSource, Sequence, Sink, Source
-from carlasc.testing.data import FRAMES, GRIDS, SCANS, WHOLE, published_bytes, write_dataset
+from carlasc.testing.data import FRAMES, GRIDS, SCANS, WHOLE, published_bytes, scan, write_dataset
 
 
 def read_sum(sequence: Sequence) -> float:
     """Return the sum of the coordinates of a scan. Called in other processes."""
     return float(sequence.read("points", FRAMES[-1])[:, :3].sum())
+
+
+def _documents(sequence: Sequence) -> dict[str, bytes]:
+    return {name: sequence.read_document(name) for name in sequence.documents()}
 
 
 class SourceContract:
@@ -89,28 +93,26 @@ class SourceContract:
             ):
                 alone, wanted = sequence.read(name, frame), reference.read(name, frame)
                 assert alone.shape == together.shape == wanted.shape
-                assert published_bytes(name, alone) == published_bytes(name, wanted), (name, frame)
-                assert published_bytes(name, together) == published_bytes(name, wanted), (
-                    name,
-                    frame,
-                )
+                bits = published_bytes(name, wanted)
+                assert published_bytes(name, alone) == bits, (name, frame)
+                assert published_bytes(name, together) == bits, (name, frame)
 
     @pytest.mark.parametrize("path", [WHOLE, SCANS, GRIDS])
     def test_has_the_same_text_files(
         self, source: Source, expected: dict[str, Sequence], path: str
     ) -> None:
-        sequence, reference = source.sequences()[path], expected[path]
-        assert set(sequence.documents()) == set(reference.documents())
-        for name in reference.documents():
-            assert sequence.read_document(name) == reference.read_document(name)
+        assert _documents(source.sequences()[path]) == _documents(expected[path])
 
     def test_points_are_float32_and_labels_unsigned(self, source: Source) -> None:
-        sequence = source.sequences()[WHOLE]
-        assert sequence.read("points", 5).dtype == np.float32
-        assert sequence.read("flow", 5).dtype == np.float32
-        assert sequence.read("instances", 5).dtype == np.uint32
-        assert sequence.read("labels", 5).dtype.kind == "u"
-        assert sequence.read("evaluation/labels", 5).dtype.kind == "u"
+        read = source.sequences()[WHOLE].read
+        for name, kind in {
+            "points": np.float32,
+            "flow": np.float32,
+            "instances": np.uint32,
+        }.items():
+            assert read(name, 5).dtype == kind
+        for name in ("labels", "evaluation/labels"):
+            assert read(name, 5).dtype.kind == "u"
 
     def test_boxes_are_the_same_empty_without_objects_and_absent_without_annotation(
         self, source: Source, expected: dict[str, Sequence]
@@ -245,19 +247,16 @@ class SinkContract:
         read_back = self.read(out).sequences()
         assert list(read_back) == list(given.sequences())
         for path, sequence in given.sequences().items():
-            assert read_back[path].fields() == sequence.fields()
-            assert {n: read_back[path].read_document(n) for n in read_back[path].documents()} == {
-                n: sequence.read_document(n) for n in sequence.documents()
-            }
+            again = read_back[path]
+            assert again.fields() == sequence.fields()
+            assert _documents(again) == _documents(sequence)
             for name in sequence.fields():
-                assert read_back[path].frames(name).tolist() == sequence.frames(name).tolist()
-                for frame in sequence.frames(name).tolist():
-                    got, wanted = read_back[path].read(name, frame), sequence.read(name, frame)
-                    assert published_bytes(name, got) == published_bytes(name, wanted), (
-                        path,
-                        name,
-                        frame,
-                    )
+                frames = sequence.frames(name).tolist()
+                assert again.frames(name).tolist() == frames
+                for frame in frames:
+                    got, wanted = again.read(name, frame), sequence.read(name, frame)
+                    same = published_bytes(name, got) == published_bytes(name, wanted)
+                    assert same, (path, name, frame)
 
     def test_has_nothing_but_what_was_written(self, given: Source, out: Path) -> None:
         writer = self.sink(out).sequence(SCANS)
@@ -283,14 +282,13 @@ class SinkContract:
             self.sink(out).sequence(SCANS).write("velocity", 0, np.zeros((5, 3), np.float32))
 
     def test_empty_arrays_keep_their_shape(self, out: Path) -> None:
+        empty = scan(np.random.default_rng(), 0)
         with self.sink(out) as sink, sink.sequence(SCANS) as writer:
-            writer.write("points", 0, np.zeros((0, 4), np.float32))
-            writer.write("flow", 0, np.zeros((0, 3), np.float32))
-            writer.write("labels", 0, np.zeros(0, np.uint32))
+            for name, array in empty.items():
+                writer.write(name, 0, array)
         sequence = self.read(out).sequences()[SCANS]
-        assert sequence.read("points", 0).shape == (0, 4)
-        assert sequence.read("flow", 0).shape == (0, 3)
-        assert sequence.read("labels", 0).shape == (0,)
+        for name, array in empty.items():
+            assert sequence.read(name, 0).shape == array.shape
 
     def test_refuses_or_takes_frames_out_of_order(self, given: Source, out: Path) -> None:
         labels = given.sequences()[SCANS].read("labels", 0)

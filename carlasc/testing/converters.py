@@ -24,7 +24,7 @@ from carlasc.core.geometry import invert, relative_to, transform_points
 from carlasc.motion import PoseOptions
 from carlasc.running import Run
 from carlasc.storage import Sequence
-from carlasc.testing.drives import KINDS, SimulatedDrive, world_T_sensor
+from carlasc.testing.drives import KINDS, MOVABLE, SimulatedDrive, world_T_sensor
 
 
 class ConverterContract:
@@ -110,30 +110,26 @@ class ConverterContract:
             np.testing.assert_allclose(points, expected, rtol=0, atol=self.points_m)
 
     def test_poses_are_those_of_the_drive(self, sequence: Sequence) -> None:
-        if "poses" not in self.keeps:
-            pytest.skip("the format has no poses")
+        self._need("poses")
         world = np.stack([world_T_sensor(self.drive, frame) for frame in range(self.drive.frames)])
         world = world @ invert(self._scan_T_first)
         np.testing.assert_allclose(sequence.poses, relative_to(world[0], world), atol=self.poses_m)
 
     def test_times_are_those_of_the_drive(self, sequence: Sequence) -> None:
-        if "times" not in self.keeps:
-            pytest.skip("the format has no times")
+        self._need("times")
         np.testing.assert_allclose(
             sequence.times, self.drive.times - self.drive.times[0], atol=1e-6
         )
 
     def test_labels_are_those_of_the_drive(self, sequence: Sequence) -> None:
-        if "labels" not in self.keeps:
-            pytest.skip("the format has no labels")
+        self._need("labels")
         lookup = np.array([self.ids.get(kind, 0) for kind in KINDS])
         for frame in self.labelled(sequence):
             kinds = self.arrange(frame, [scan.kinds for scan in self._scans(frame)])
             np.testing.assert_array_equal(sequence.read("labels", frame), lookup[kinds])
 
     def test_an_actor_has_one_number_of_its_own(self, sequence: Sequence) -> None:
-        if "instances" not in self.keeps:
-            pytest.skip("the format has no instances")
+        self._need("instances")
         numbers: dict[int, int] = {}
         for frame in self.labelled(sequence):
             truth = self.arrange(frame, [scan.instances for scan in self._scans(frame)])
@@ -146,8 +142,7 @@ class ConverterContract:
         assert len(numbers) == len(set(numbers.values())) > 0
 
     def test_boxes_are_those_of_the_drive(self, sequence: Sequence) -> None:
-        if "boxes" not in self.keeps:
-            pytest.skip("the format has no boxes")
+        self._need("boxes")
         numbers: dict[int, int] = {}
         frames = 0
         for frame in sequence.frames("boxes").tolist():
@@ -182,11 +177,7 @@ class ConverterContract:
         truth = self.arrange(frame, [scan.instances for scan in self._scans(frame)])
         flow, instances = sequence.read("flow", frame), sequence.read("instances", frame)
         speed = np.linalg.norm(flow, axis=1)
-        things = [
-            thing
-            for thing in self.drive.things
-            if thing.kind in ("car", "van", "pedestrian", "cyclist")
-        ]
+        things = [thing for thing in self.drive.things if thing.kind in MOVABLE]
         compared = 0
         for track, thing in enumerate(things, 1):
             own = (truth == track) & (instances > 0)
@@ -242,6 +233,10 @@ class ConverterContract:
             assert (tmp_path / "out" / path.relative_to(out)).read_bytes() == path.read_bytes(), (
                 path.name
             )
+
+    def _need(self, content: str) -> None:
+        if content not in self.keeps:
+            pytest.skip(f"the format has no {content}")
 
     def _class(self) -> type[Converter]:
         return load_converter(self.converter) if isinstance(self.converter, str) else self.converter

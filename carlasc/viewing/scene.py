@@ -16,13 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from carlasc.core.arrays import AnyArray, FloatArray, IntArray, LabelArray, Uint32Array
-from carlasc.core.axes import mirror_boxes, mirror_poses, mirror_scan, mirror_spec, mirror_voxels
-from carlasc.core.boxes import Boxes
+from carlasc.core.boxes import Boxes, mirror_boxes
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
-from carlasc.core.geometry import Transform, check_rigid
-from carlasc.core.grids import Grid, GridSpec
-from carlasc.core.scans import Scan
+from carlasc.core.geometry import Transform, check_rigid, mirror_poses
+from carlasc.core.grids import Grid, GridSpec, mirror_spec, mirror_voxels
+from carlasc.core.scans import Scan, mirror_scan
 from carlasc.core.tables import TABLES, remaps_between, to_table
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_choice, first_names
 from carlasc.metrics.grids import check_same_geometry, compare_grids

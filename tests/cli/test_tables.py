@@ -19,7 +19,7 @@ NAMES = [
 
 def printed(width, *arguments, **options):
     file = io.StringIO()
-    print_table(Console(width=width, file=file), *arguments, **options)
+    print_table(*arguments, console=Console(width=width, file=file), **options)
     return file.getvalue()
 
 
@@ -126,7 +126,12 @@ def test_a_table_without_rows_has_its_header():
 
 def test_names_from_data_do_not_steer_the_terminal():
     console = Console(width=80, record=True, file=io.StringIO())
-    print_table(console, ["\x1b[2JName", "B"], [["a\x1b]0;x\x07", "[/bold]"]], title="\u202eT")
+    print_table(
+        ["\x1b[2JName", "B"],
+        [["a\x1b]0;x\x07", "[/bold]"]],
+        title="\u202eT",
+        console=console,
+    )
     text = console.export_text()
     assert all(part in text for part in ("\\x1b[2JName", "a\\x1b]0;x\\x07", "[/bold]", "\\u202eT"))
     assert not {"\x1b", "\x07", "\u202e"} & set(text)

@@ -5,15 +5,22 @@ import pytest
 from helpers.datasets.recordings import MemoryFrame, MemoryRecording, MemoryWriter
 
 from carlasc.converting import Cloud, Sensor, Trajectory, VoxelContent
-from carlasc.converting.assembling import Rig, VehicleMotion, assemble
-from carlasc.converting.frame_stages import ScanBlock, ScanJob, make_fields
-from carlasc.converting.layout_options import AxesAndClasses
-from carlasc.converting.plans import begin, choose_recordings, plan_recording
-from carlasc.converting.results import check_outside
-from carlasc.converting.trajectory import frame_times, jitter, read_trajectory, scan_poses
+from carlasc.converting.assembling import AxesAndClasses, Rig, VehicleMotion, assemble, make_fields
+from carlasc.converting.plans import (
+    begin,
+    choose_recordings,
+    frame_times,
+    jitter,
+    plan_recording,
+    read_trajectory,
+    scan_poses,
+)
+from carlasc.converting.protocol import check_outside
+from carlasc.converting.stages import Block, ScanJob, ScanStage
 from carlasc.core import REMAPS, SEMANTICKITTI, Boxes, GridSpec
-from carlasc.core.axes import mirror_boxes, mirror_grid, mirror_points, mirror_poses, mirror_spec
-from carlasc.core.geometry import rotation_z, translation
+from carlasc.core.boxes import mirror_boxes
+from carlasc.core.geometry import mirror_points, mirror_poses, rotation_z, translation
+from carlasc.core.grids import mirror_grid, mirror_spec
 from carlasc.errors import ConflictError, FormatError, MissingDataError, StorageError
 from carlasc.motion import PoseOptions
 from carlasc.storage import Metadata, layout
@@ -114,7 +121,8 @@ def voxels_of(labels, known=None):
 
 def convert_voxels(target, voxels, writer):
     frame = MemoryFrame(0, frame_of([0]).content, voxels)
-    return ScanBlock((ScanJob(frame, write=False),), target, writer, RIG, VOXELS).convert()[0]
+    stage = ScanStage(target, writer, RIG, VOXELS)
+    return Block(stage, (ScanJob(frame, write=False),)).convert()[0]
 
 
 def test_own_voxels_are_mapped_mirrored_and_kept():
@@ -151,7 +159,7 @@ def test_voxels_that_are_written_already_are_not_read_again():
 
 def test_a_frame_that_cannot_be_read_is_a_failure_and_a_store_that_cannot_be_written_ends_the_run():
     jobs = (ScanJob(MemoryFrame(0, None)), ScanJob(frame_of([0], number=1)))
-    failed, read = ScanBlock(jobs, RIGHT, MemoryWriter(), RIG).convert()
+    failed, read = Block(ScanStage(RIGHT, MemoryWriter(), RIG), jobs).convert()
     assert "expected points, found nothing" in failed.failure
     assert (failed.number, read.number, read.failure) == (0, 1, None)
     assert "points" in read.fields

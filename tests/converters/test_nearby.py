@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from carlasc.converting.frame_stages import labels_nearby
+from carlasc.converting.actors import labels_nearby
 from carlasc.core.tables import CARLA
 
 ROAD, BUILDING, POLE, VEHICLE, PERSON, SIDEWALK = 7, 1, 5, 10, 4, 8

@@ -8,9 +8,14 @@ from carlasc_converters.exporters import opensceneflow
 from helpers.datasets.exported import files_and_bytes, read_index
 
 from carlasc.converting import export
-from carlasc.core.axes import mirror_boxes, mirror_points, mirror_poses
-from carlasc.core.boxes import Boxes
-from carlasc.core.geometry import invert, rotate_vectors, transform_points
+from carlasc.core.boxes import Boxes, mirror_boxes
+from carlasc.core.geometry import (
+    invert,
+    mirror_points,
+    mirror_poses,
+    rotate_vectors,
+    transform_points,
+)
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.running import Run
 from carlasc.storage import FolderSink, layout

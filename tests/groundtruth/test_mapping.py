@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import carlasc
 from carlasc import GridSpec, Run
-from carlasc.core.axes import mirror_voxels
 from carlasc.core.geometry import relative_to, transform_points
+from carlasc.core.grids import mirror_voxels
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
 from carlasc.groundtruth import Voting

@@ -17,10 +17,9 @@ from typing import Any, Self
 import numpy as np
 
 from carlasc.core.arrays import AnyArray, FloatArray, IntArray
-from carlasc.core.axes import mirror_poses, mirror_voxels
 from carlasc.core.frames import FrameRange, Frames
-from carlasc.core.geometry import invert, transform_points
-from carlasc.core.grids import GridSpec
+from carlasc.core.geometry import invert, mirror_poses, transform_points
+from carlasc.core.grids import GridSpec, mirror_voxels
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.groundtruth.from_scans.feed import ScanFeed, WithoutScans
 from carlasc.groundtruth.from_scans.merging import Merger

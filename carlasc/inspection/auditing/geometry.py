@@ -15,8 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from carlasc.core.arrays import FloatArray
-from carlasc.core.axes import choices_of_axes
-from carlasc.core.geometry import rotation_z
+from carlasc.core.geometry import choices_of_axes, rotation_z
 from carlasc.core.grids import GridSpec
 from carlasc.errors import count
 from carlasc.inspection.auditing.matching import MatchedGrids

@@ -13,8 +13,8 @@ import numpy as np
 from carlasc import storage
 from carlasc.converting import FrameExporter, TargetFrame, is_same, resample_to, resampling_notes
 from carlasc.core.arrays import BoolArray, Float32Array, LabelArray
-from carlasc.core.axes import mirror_points
 from carlasc.core.benchmarks import IGNORED
+from carlasc.core.geometry import mirror_points
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc_converters.exporters.classes import classes_of, lookup_of, mapping_of

@@ -20,8 +20,9 @@ from carlasc.core.arrays import (
     LabelArray,
     Uint32Array,
 )
-from carlasc.core.axes import mirror_grid, mirror_poses, mirror_spec
 from carlasc.core.classes import ClassTable
+from carlasc.core.geometry import mirror_poses
+from carlasc.core.grids import mirror_grid, mirror_spec
 from carlasc.core.tables import CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_choice
 from carlasc.storage import layout

@@ -19,9 +19,8 @@ import numpy as np
 from carlasc import storage
 from carlasc.converting import Exported, Files, TargetFrame, resample_to
 from carlasc.core.arrays import Uint8Array
-from carlasc.core.axes import mirror_poses
 from carlasc.core.benchmarks import TO_OCC3D
-from carlasc.core.geometry import quaternions_of, translation
+from carlasc.core.geometry import mirror_poses, quaternions_of, translation
 from carlasc.core.grids import GridSpec
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json

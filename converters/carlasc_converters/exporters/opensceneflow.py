@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from carlasc import storage
 from carlasc.converting import Exported, Files, SequenceExporter, SequenceFile
 from carlasc.core.arrays import AnyArray, Float32Array, LabelArray, Uint32Array
-from carlasc.core.axes import mirror_boxes, mirror_points, mirror_poses
-from carlasc.core.boxes import Boxes
-from carlasc.core.geometry import Transform, invert, transform_points
+from carlasc.core.boxes import Boxes, mirror_boxes
+from carlasc.core.geometry import Transform, invert, mirror_points, mirror_poses, transform_points
 from carlasc.core.tables import SEMANTICKITTI
 from carlasc.errors import FormatError, MissingDataError, import_extra
 from carlasc.motion import ground_points
