@@ -9,17 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from carlasc.core.arrays import AnyArray, AnyFloatArray, FloatArray, IntArray
+from carlasc.core.arrays import AnyArray, FloatArray
 from carlasc.core.geometry import Transform, invert
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.metrics.casting import cast_rays, cast_rays_on_device, rayiou_directions
-from carlasc.metrics.confusion import device_of, ratio, to_numpy
+from carlasc.metrics.casting import cast_rays, rayiou_directions
+from carlasc.metrics.confusion import check_free, check_ids, ratio, to_numpy
 from carlasc.metrics.panoptic import PanopticQuality, PanopticScore, match_segments
 from carlasc.metrics.scoring import Summed
 
@@ -114,8 +114,7 @@ class RayIoU(Summed):
 
         `directions` are (R, 3) unit vectors of the rays; None takes `rayiou_directions`.
         """
-        if not 0 <= free < num_classes:
-            raise ArgumentError("free", expected=f"a class id below {num_classes}", found=str(free))
+        check_free(free, num_classes)
         self.num_classes, self.free, self.thresholds_m = num_classes, free, tuple(thresholds_m)
         self.skip_unknown = skip_unknown
         self.directions = (
@@ -140,8 +139,7 @@ class RayIoU(Summed):
         """Add a frame.
 
         Args:
-            prediction: (X, Y, Z) class ids, NumPy or a torch tensor; rays are cast on the device of
-                a tensor.
+            prediction: (X, Y, Z) class ids, NumPy or a torch tensor.
             truth: (X, Y, Z) class ids, NumPy or a torch tensor.
             spec: geometry of both, Cartesian.
             origins: (O, 3) ray origins, metres, in the frame of the grid (see `ray_origins`).
@@ -155,7 +153,6 @@ class RayIoU(Summed):
             ArgumentError: the grid is cylindrical, or `skip_unknown` is set and `known` is missing.
         """
         pred, true = self._check(prediction, "prediction", spec), self._check(truth, "truth", spec)
-        device = device_of(prediction, truth)
         grids = [pred, true]
         if self.skip_unknown:
             if known is None:
@@ -165,7 +162,9 @@ class RayIoU(Summed):
             seen = np.asarray(known, np.bool_)
             # unknown voxels stop a ray here
             grids.append(np.where(seen, true, self.num_classes).astype(np.uint16))
-        voxels, depths = self._cast(np.stack(grids), spec, np.asarray(origins), device)
+        voxels, depths = cast_rays(
+            np.stack(grids), spec, np.asarray(origins), self.directions, free=self.free
+        )
         valid = voxels[1] >= 0
         if self.skip_unknown:
             valid &= voxels[2] == voxels[1]
@@ -182,20 +181,6 @@ class RayIoU(Summed):
             )
         return self
 
-    def _cast(
-        self, grids: AnyArray, spec: GridSpec, origins: AnyFloatArray, device: Any
-    ) -> tuple[IntArray, FloatArray]:
-        """Cast the rays on the device of the given tensors, or on the CPU in compiled code."""
-        if device is None:
-            return cast_rays(grids, spec, origins, self.directions, free=self.free)
-        import torch
-
-        on_device = torch.from_numpy(grids.astype(np.int32)).to(device)
-        voxels, depths = cast_rays_on_device(
-            on_device, spec, origins, self.directions, free=self.free
-        )
-        return voxels.cpu().numpy(), depths.cpu().numpy()
-
     def compute(self) -> RayScore:
         """Return the score of all added frames."""
         iou = ratio(self.hits, self.true + self.predicted - self.hits)
@@ -205,15 +190,7 @@ class RayIoU(Summed):
         array = to_numpy(labels)
         if array.shape != spec.size:
             raise FormatError(name, expected=f"shape {spec.size}", found=str(array.shape))
-        if array.dtype.kind not in "ui" or (
-            array.size and (array.min() < 0 or array.max() >= self.num_classes)
-        ):
-            found = (
-                f"{array.dtype} from {array.min()} to {array.max()}"
-                if array.size
-                else str(array.dtype)
-            )
-            raise FormatError(name, expected=f"class ids 0..{self.num_classes - 1}", found=found)
+        check_ids(name, array, self.num_classes)
         return array.astype(np.uint16, copy=False)
 
 

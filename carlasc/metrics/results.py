@@ -370,7 +370,7 @@ def bootstrap(
     Raises:
         ArgumentError: fewer than five sequences are given.
     """
-    _checkjson_number(len(matrices))
+    _check_number(len(matrices))
     counts = np.stack([matrix.counts for matrix in matrices])
     draws = np.random.default_rng(_SEED).integers(0, len(counts), (_DRAWS, len(counts)))
     values = [score(_matrix(counts[draw].sum(axis=0), matrices[0])) for draw in draws]
@@ -406,7 +406,7 @@ def compare(
         raise MissingDataError(
             "second", expected="sequences of the first", found=", ".join(sorted(second)) or "none"
         )
-    _checkjson_number(len(common))
+    _check_number(len(common))
     like = first[common[0]]
     a, b = (np.stack([side[path].counts for path in common]) for side in (first, second))
 
@@ -433,7 +433,7 @@ def compare(
     return Comparison(_interval(observed, spread, level), p_value, common)
 
 
-def _checkjson_number(sequences: int) -> None:
+def _check_number(sequences: int) -> None:
     if sequences < _FEWEST_SEQUENCES:
         raise ArgumentError(
             "sequences",

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.metrics.confusion import check_ids, to_numpy
+from carlasc.metrics.confusion import check_free, check_ids, to_numpy
 from carlasc.metrics.scoring import Summed
 
 _BINS = 15
@@ -84,8 +84,7 @@ class Uncertainty(Summed):
     _SETTINGS, _SUMS = ("num_classes", "free", "bins"), ("sums", "nll", "ece")
 
     def __init__(self, num_classes: int, *, free: int = 0, bins: int = _BINS) -> None:
-        if not 0 <= free < num_classes:
-            raise ArgumentError("free", expected=f"a class id below {num_classes}", found=str(free))
+        check_free(free, num_classes)
         if bins < 1:
             raise ArgumentError("bins", expected="at least 1", found=str(bins))
         self.num_classes, self.free, self.bins = num_classes, free, bins
