@@ -53,8 +53,8 @@ def view(
     for Rerun or Foxglove (--out).
 
     In all of them, you can rotate and zoom, and step through the frames. Pages and recordings also
-    show and hide the grid, points, scene flow, boxes, tracks and classes. Without --frames, a file shows the first 60 frames; a window and
-    the folder of a page show all frames.
+    show and hide the grid, points, scene flow, boxes, tracks and classes. Without --frames, a file
+    shows the first 60 frames; a window and the folder of a page show all frames.
     """
     shown: carlasc.Scene = scene.make(source)
     if out is None:
