@@ -23,7 +23,7 @@ from carlasc.metrics.confusion import check_free, check_ids, ratio, to_numpy
 from carlasc.metrics.panoptic import PanopticQuality, PanopticScore, match_segments
 from carlasc.metrics.scoring import Summed
 
-THRESHOLDS_M = (1.0, 2.0, 4.0)
+THRESHOLDS_M = (1.0, 2.0, 4.0)  # between the distances of a correct ray
 _MOST_ORIGINS = 8
 # minimum distance of origins from the sides of the grid: up to 39 m in the grid of Occ3D, which
 # ends at 40 m
@@ -61,19 +61,17 @@ class RayScore:
     Attributes:
         class_iou: (T, K) IoU of each class at each depth threshold; NaN for classes that do not
             occur in prediction or ground truth.
-        thresholds_m: (T,) metres.
         free: id of free space, which is not scored.
     """
 
     class_iou: FloatArray
-    thresholds_m: tuple[float, ...]
     free: int
 
     @property
     def by_threshold(self) -> dict[float, float]:
         """RayIoU by threshold, metres: the mean over the occurring classes except free."""
         things = np.delete(self.class_iou, self.free, axis=1)
-        return {t: _mean(row) for t, row in zip(self.thresholds_m, things, strict=True)}
+        return {t: _mean(row) for t, row in zip(THRESHOLDS_M, things, strict=True)}
 
     @property
     def rayiou(self) -> float:
@@ -91,13 +89,12 @@ class RayIoU(Summed):
     Attributes:
         num_classes: K; ids are 0..K-1.
         free: id of free space.
-        thresholds_m: maximum differences of distances, metres.
         skip_unknown: leave out rays that cross an unknown voxel before the first surface of the
             ground truth. In the original metric, unknown voxels count as free.
     """
 
     _SETTINGS, _SUMS = (
-        ("num_classes", "free", "thresholds_m", "skip_unknown"),
+        ("num_classes", "free", "skip_unknown"),
         ("true", "predicted", "hits"),
     )
 
@@ -106,7 +103,6 @@ class RayIoU(Summed):
         num_classes: int,
         *,
         free: int = 0,
-        thresholds_m: tuple[float, ...] = THRESHOLDS_M,
         skip_unknown: bool = False,
         directions: ArrayLike | None = None,
     ) -> None:
@@ -115,8 +111,7 @@ class RayIoU(Summed):
         `directions` are (R, 3) unit vectors of the rays; None takes `rayiou_directions`.
         """
         check_free(free, num_classes)
-        self.num_classes, self.free, self.thresholds_m = num_classes, free, tuple(thresholds_m)
-        self.skip_unknown = skip_unknown
+        self.num_classes, self.free, self.skip_unknown = num_classes, free, skip_unknown
         self.directions = (
             rayiou_directions() if directions is None else np.asarray(directions, np.float64)
         )
@@ -126,7 +121,7 @@ class RayIoU(Summed):
         """Set all sums to zero."""
         self.true = np.zeros(self.num_classes, np.int64)
         self.predicted = np.zeros(self.num_classes, np.int64)
-        self.hits = np.zeros((len(self.thresholds_m), self.num_classes), np.int64)
+        self.hits = np.zeros((len(THRESHOLDS_M), self.num_classes), np.int64)
 
     def update(
         self,
@@ -175,7 +170,7 @@ class RayIoU(Summed):
         self.true += np.bincount(flat_true, minlength=self.num_classes)
         self.predicted += np.bincount(flat_pred, minlength=self.num_classes)
         same = flat_pred == flat_true
-        for row, threshold in enumerate(self.thresholds_m):
+        for row, threshold in enumerate(THRESHOLDS_M):
             self.hits[row] += np.bincount(
                 flat_true[same & (off < threshold)], minlength=self.num_classes
             )
@@ -184,7 +179,7 @@ class RayIoU(Summed):
     def compute(self) -> RayScore:
         """Return the score of all added frames."""
         iou = ratio(self.hits, self.true + self.predicted - self.hits)
-        return RayScore(iou, self.thresholds_m, self.free)
+        return RayScore(iou, self.free)
 
     def _check(self, labels: ArrayLike, name: str, spec: GridSpec) -> AnyArray:
         array = to_numpy(labels)
@@ -209,19 +204,13 @@ class RayPQ:
         things: frozenset[int],
         *,
         free: int = 0,
-        thresholds_m: tuple[float, ...] = THRESHOLDS_M,
         directions: ArrayLike | None = None,
     ) -> None:
         """Create an empty metric.
 
         `directions` are (R, 3) unit vectors of the rays; None takes `rayiou_directions`.
         """
-        self.num_classes, self.things, self.free, self.thresholds_m = (
-            num_classes,
-            things,
-            free,
-            tuple(thresholds_m),
-        )
+        self.num_classes, self.things, self.free = num_classes, things, free
         self.directions = (
             rayiou_directions() if directions is None else np.asarray(directions, np.float64)
         )
@@ -229,10 +218,10 @@ class RayPQ:
 
     def reset(self) -> None:
         """Set all sums to zero."""
-        self.qualities = [
-            PanopticQuality(self.num_classes, self.things, free=self.free)
-            for _ in self.thresholds_m
-        ]
+        self.qualities = {
+            threshold: PanopticQuality(self.num_classes, self.things, free=self.free)
+            for threshold in THRESHOLDS_M
+        }
 
     def update(
         self,
@@ -261,7 +250,7 @@ class RayPQ:
         is_thing = np.isin(classes[1], sorted(self.things))
         ids = pred_ids.reshape(-1)[near], np.where(is_thing, true_ids.reshape(-1)[far], 0)
         off = np.abs(depths[0] - depths[1])[valid]
-        for quality, threshold in zip(self.qualities, self.thresholds_m, strict=True):
+        for threshold, quality in self.qualities.items():
             segments = match_segments(
                 (classes[0], ids[0]), (classes[1], ids[1]), overlap=off < threshold, free=self.free
             )
@@ -272,10 +261,7 @@ class RayPQ:
         """Return the panoptic score at each depth threshold, metres; RayPQ is the mean of their
         `pq`.
         """
-        return {
-            t: quality.compute()
-            for t, quality in zip(self.thresholds_m, self.qualities, strict=True)
-        }
+        return {threshold: quality.compute() for threshold, quality in self.qualities.items()}
 
     def merge(self, other: RayPQ) -> Self:
         """Add the sums of another metric with the same settings.
@@ -283,8 +269,8 @@ class RayPQ:
         Raises:
             ArgumentError: its settings differ.
         """
-        for own, theirs in zip(self.qualities, other.qualities, strict=True):
-            own.merge(theirs)
+        for threshold, quality in self.qualities.items():
+            quality.merge(other.qualities[threshold])
         return self
 
 
