@@ -102,14 +102,7 @@ def with_boxes(drawing: Drawing, boxes: Boxes) -> Drawing:
     """Return a drawing with the edges of boxes, and a bar on the floor of each from its middle to
     its front.
     """
-    if not len(boxes.tracks):
-        return drawing
-    mesh = box_edges(boxes)
-    return replace(
-        drawing,
-        mesh=mesh if drawing.mesh is None else join([drawing.mesh, mesh]),
-        legend=[*drawing.legend, BOX],
-    )
+    return drawing.with_mesh(box_edges(boxes), BOX) if len(boxes.tracks) else drawing
 
 
 def box_edges(boxes: Boxes) -> QuadMesh:

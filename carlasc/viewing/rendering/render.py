@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -33,9 +34,9 @@ from carlasc.viewing.rendering.pages import draw_legend
 from carlasc.viewing.rendering.panels import (
     Cell,
     FrameRenderer,
-    PictureRenderer,
     caption_panels,
     columns_of,
+    draw_shot,
     plan_cells,
 )
 from carlasc.viewing.rendering.styles import StyleOptions
@@ -170,16 +171,17 @@ def render(
     )
     entries = merge_legends(shown)
     sheet = replace(style.sheet, size=encodable_size(target, style.sheet.size))
-    drawer = PictureRenderer(
-        sheet,
-        [] if sheet.legend_apart else entries,
-        caption_panels(pictures[0], style.captions, film) if together else (),
-        style.columns or (columns_of(pictures[0]) if together else None),
+    draw = partial(
+        draw_shot,
+        sheet=sheet,
+        legend=[] if sheet.legend_apart else entries,
+        captions=caption_panels(pictures[0], style.captions, film) if together else (),
+        columns=style.columns or (columns_of(pictures[0]) if together else None),
     )
     shots = _plan_shots(pictures, camera)
     if fps is None:
         fps = _ORBIT_FPS if camera.orbit and len(pictures) == 1 else _DRIVE_FPS
-    with closing(run_all(drawer.render, shots, run)) as drawn:
+    with closing(run_all(draw, shots, run)) as drawn:
         write_pictures(target, _reported(drawn, len(shots), run.progress), fps, sheet.dpi)
     if legend_file is not None and entries and sheet.font_size is not None:
         write_pictures(
