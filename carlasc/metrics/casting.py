@@ -67,10 +67,7 @@ def cast_rays(
     Raises:
         ArgumentError: the grid is cylindrical, or the shapes do not match.
     """
-    if spec.coordinates != "cartesian":
-        raise ArgumentError(
-            "grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates
-        )
+    _check_cartesian(spec)
     if grids.ndim != 4 or grids.shape[1:] != spec.size:
         raise ArgumentError(
             "grids", expected=f"shape (G, {', '.join(map(str, spec.size))})", found=str(grids.shape)
@@ -99,6 +96,13 @@ def cast_rays(
     return voxels, depth
 
 
+def _check_cartesian(spec: GridSpec) -> None:
+    if spec.coordinates != "cartesian":
+        raise ArgumentError(
+            "grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates
+        )
+
+
 def follow_rays(
     solid: Uint8Array,
     spec: GridSpec,
@@ -123,10 +127,7 @@ def follow_rays(
     Raises:
         ArgumentError: the grid is cylindrical.
     """
-    if spec.coordinates != "cartesian":
-        raise ArgumentError(
-            "grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates
-        )
+    _check_cartesian(spec)
     ends, lower, voxel = np.asarray(points, np.float64), np.array(spec.lower), spec.voxel_size
     first, passed = np.full(len(ends), np.inf), np.zeros(len(ends), np.uint8)
     start, size = (np.asarray(origin, np.float64) - lower) / voxel, np.array(spec.size)

@@ -187,16 +187,12 @@ class Scorer:
         if self.scoring.region is not None and spec is not None:
             region = self.scoring.region(spec).reshape(truth.shape)
         try:
-            matrix = self.convention.count(
+            prepared = self.convention.prepare(
                 (prediction, tables[0]), (truth, tables[1]), known, region
             )
+            matrix = self._matrix().update(*prepared)
             if (self.scoring.by or self.scoring.rays or self.scoring.actors) and spec is not None:
-                pred, true, counted = self.convention.prepare(
-                    (prediction.reshape(spec.size), tables[0]),
-                    (truth.reshape(spec.size), tables[1]),
-                    known,
-                    region,
-                )
+                pred, true, counted = (array.reshape(spec.size) for array in prepared)
                 if self.actors is not None:
                     self.actors.update(pair, frame, (pred, true, counted))
                 for masks in self._masks(pair, frame, spec, true, known, tables[1]):

@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from carlasc.core.arrays import AnyArray, FloatArray
+from carlasc.core.arrays import AnyArray, FloatArray, IntArray
 from carlasc.core.geometry import Transform, invert
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, FormatError
@@ -148,7 +148,7 @@ class RayIoU(Summed):
             ArgumentError: the grid is cylindrical, or `skip_unknown` is set and `known` is missing.
         """
         pred, true = self._check(prediction, "prediction", spec), self._check(truth, "truth", spec)
-        grids = [pred, true]
+        further = []
         if self.skip_unknown:
             if known is None:
                 raise ArgumentError(
@@ -156,17 +156,9 @@ class RayIoU(Summed):
                 )
             seen = np.asarray(known, np.bool_)
             # unknown voxels stop a ray here
-            grids.append(np.where(seen, true, self.num_classes).astype(np.uint16))
-        voxels, depths = cast_rays(
-            np.stack(grids), spec, np.asarray(origins), self.directions, free=self.free
-        )
-        valid = voxels[1] >= 0
-        if self.skip_unknown:
-            valid &= voxels[2] == voxels[1]
-        flat_pred, flat_true = pred.reshape(-1)[voxels[0]], true.reshape(-1)[voxels[1]]
-        valid &= flat_true != self.free
-        flat_pred, flat_true = flat_pred[valid], flat_true[valid]
-        off = np.abs(depths[0] - depths[1])[valid]
+            further.append(np.where(seen, true, self.num_classes).astype(np.uint16))
+        near, far, off = _first_surfaces([pred, true, *further], spec, origins, self)
+        flat_pred, flat_true = pred.reshape(-1)[near], true.reshape(-1)[far]
         self.true += np.bincount(flat_true, minlength=self.num_classes)
         self.predicted += np.bincount(flat_pred, minlength=self.num_classes)
         same = flat_pred == flat_true
@@ -241,15 +233,10 @@ class RayPQ:
         (pred, pred_ids), (true, true_ids) = (
             [to_numpy(a) for a in side] for side in (prediction, truth)
         )
-        voxels, depths = cast_rays(
-            np.stack([pred, true]), spec, np.asarray(origins), self.directions, free=self.free
-        )
-        valid = (voxels[1] >= 0) & (true.reshape(-1)[voxels[1]] != self.free)
-        near, far = voxels[0][valid], voxels[1][valid]
+        near, far, off = _first_surfaces([pred, true], spec, origins, self)
         classes = pred.reshape(-1)[near], true.reshape(-1)[far]
         is_thing = np.isin(classes[1], sorted(self.things))
         ids = pred_ids.reshape(-1)[near], np.where(is_thing, true_ids.reshape(-1)[far], 0)
-        off = np.abs(depths[0] - depths[1])[valid]
         for threshold, quality in self.qualities.items():
             segments = match_segments(
                 (classes[0], ids[0]), (classes[1], ids[1]), overlap=off < threshold, free=self.free
@@ -272,6 +259,27 @@ class RayPQ:
         for threshold, quality in self.qualities.items():
             quality.merge(other.qualities[threshold])
         return self
+
+
+def _first_surfaces(
+    grids: list[AnyArray], spec: GridSpec, origins: ArrayLike, metric: RayIoU | RayPQ
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return the first voxel of the prediction and of the ground truth on each ray with a surface
+    in the ground truth, and the difference of their distances, metres.
+
+    Args:
+        grids: class ids of the prediction and of the ground truth; a third grid drops rays whose
+            first voxel is another one in it than in the ground truth.
+        spec: geometry of the grids.
+        origins: (O, 3) metres.
+        metric: has the directions of the rays and the id of free space.
+    """
+    voxels, depths = cast_rays(
+        np.stack(grids), spec, np.asarray(origins), metric.directions, free=metric.free
+    )
+    valid = (voxels[1] >= 0) & (grids[1].reshape(-1)[voxels[1]] != metric.free)
+    valid &= voxels[-1] == voxels[1] if len(grids) > 2 else True
+    return voxels[0][valid], voxels[1][valid], np.abs(depths[0] - depths[1])[valid]
 
 
 def _mean(values: FloatArray) -> float:

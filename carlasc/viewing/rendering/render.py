@@ -25,7 +25,9 @@ from carlasc.viewing.rendering.cameras import CameraOptions, Viewpoint
 from carlasc.viewing.rendering.drawings import GridColor, check_color
 from carlasc.viewing.rendering.encoding import (
     FILMS,
+    NAME_A_FILM,
     STILLS,
+    check_single,
     encodable_size,
     is_film,
     write_pictures,
@@ -142,7 +144,7 @@ def render(
     """
     started = time.monotonic()
     together = not isinstance(source, _ONE)
-    scenes = [as_scene(source)] if isinstance(source, _ONE) else [as_scene(one) for one in source]
+    scenes = [as_scene(one) for one in ([source] if isinstance(source, _ONE) else source)]
     if not scenes:
         raise ArgumentError("source", expected="at least one source", found="none")
     if not together and (style.captions or style.columns is not None):
@@ -232,12 +234,10 @@ def _check_kind(
 
     `alone` is the reader if each of its frames is a picture of its own, or None.
     """
-    advice = "name a .gif, .mp4 or .webp"
-    if not film and alone is not None and len(alone.frames) > 1:
-        found = f"{len(alone.frames)} frames for {target.name}"
-        raise ArgumentError("out", expected="a single frame for a PNG", found=found, advice=advice)
+    if alone is not None:
+        check_single(target, alone.frames)
     if orbit and not film:
-        raise ArgumentError("orbit", expected="a film", found=target.name, advice=advice)
+        raise ArgumentError("orbit", expected="a film", found=target.name, advice=NAME_A_FILM)
     if style.name == "paper" and film:
         raise ArgumentError(
             "style", expected="screen for a film", found=style.name, advice="name a .png"
