@@ -127,7 +127,7 @@ class ConfusionMatrix(Summed):
         """
         return {"miou": self.miou, "accuracy": self.accuracy, **vars(self.completeness())}
 
-    def __iadd__(self, other: ConfusionMatrix) -> Self:
+    def __iadd__(self, other: Self) -> Self:
         return self.merge(other)
 
     def __add__(self, other: ConfusionMatrix) -> ConfusionMatrix:
@@ -375,21 +375,20 @@ def count_tensors(
     """
     import torch
 
-    def on_device(array: Labels) -> torch.Tensor:
-        if not isinstance(array, torch.Tensor):
-            array = torch.from_numpy(np.asarray(array).astype(np.int64))
-        return array.to(device).reshape(-1)
+    def flat(array: Labels) -> torch.Tensor:
+        return torch.as_tensor(array, device=device).reshape(-1)
 
-    ids = {"prediction": on_device(prediction), "truth": on_device(truth)}
-    for name, labels in ids.items():
-        if labels.is_floating_point() or labels.is_complex():
-            raise FormatError(name, expected="integer class ids", found=str(labels.dtype))
-        counted = labels.long() if mask is None else labels.long()[on_device(mask).bool()]
-        wrong = counted[(counted < 0) | (counted >= num_classes)]
-        if wrong.numel():
-            raise _out_of_range(name, int(wrong[0]), wrong.numel(), num_classes)
-        ids[name] = counted
-    pairs = torch.bincount(ids["truth"] * num_classes + ids["prediction"], minlength=num_classes**2)
+    predicted, true = flat(prediction), flat(truth)
+    if mask is not None:
+        counted = flat(mask).bool()
+        predicted, true = predicted[counted], true[counted]
+    for ids in (predicted, true):
+        whole = not (ids.is_floating_point() or ids.is_complex())
+        if not whole or (ids.numel() and (ids.min() < 0 or ids.max() >= num_classes)):
+            known = None if mask is None else to_numpy(mask)
+            # raises the error that names the id
+            return count_arrays(to_numpy(prediction), to_numpy(truth), known, num_classes)
+    pairs = torch.bincount(true.long() * num_classes + predicted.long(), minlength=num_classes**2)
     return pairs.reshape(num_classes, num_classes).cpu().numpy()
 
 

@@ -187,12 +187,13 @@ class Scorer:
         if self.scoring.region is not None and spec is not None:
             region = self.scoring.region(spec).reshape(truth.shape)
         try:
-            prepared = self.convention.prepare(
+            pred, true, counted = self.convention.prepare(
                 (prediction, tables[0]), (truth, tables[1]), known, region
             )
-            matrix = self._matrix().update(*prepared)
+            matrix = self._matrix().update(pred, true, counted)
             if (self.scoring.by or self.scoring.rays or self.scoring.actors) and spec is not None:
-                pred, true, counted = (array.reshape(spec.size) for array in prepared)
+                pred, true = pred.reshape(spec.size), true.reshape(spec.size)
+                counted = counted.reshape(spec.size)
                 if self.actors is not None:
                     self.actors.update(pair, frame, (pred, true, counted))
                 for masks in self._masks(pair, frame, spec, true, known, tables[1]):

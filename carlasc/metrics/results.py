@@ -367,8 +367,10 @@ def bootstrap(matrices: Sequence[ConfusionMatrix], score: Score) -> Interval:
     _check_number(len(matrices))
     counts = np.stack([matrix.counts for matrix in matrices])
     draws = np.random.default_rng(_SEED).integers(0, len(counts), (_DRAWS, len(counts)))
-    values = [score(_matrix(counts[draw].sum(axis=0), matrices[0])) for draw in draws]
-    return _interval(score(_matrix(counts.sum(axis=0), matrices[0])), values)
+    value, *values = (
+        score(_matrix(counts[rows].sum(axis=0), matrices[0])) for rows in (slice(None), *draws)
+    )
+    return _interval(value, values)
 
 
 def compare(
