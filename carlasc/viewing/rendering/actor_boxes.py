@@ -54,8 +54,7 @@ def boxes_in(data: RemappedSequence, frame: int) -> Boxes:
     Raises:
         FormatError: the boxes or the scan do not have the format.
     """
-    annotated = data.read_boxes(frame)
-    if annotated is not None:
+    if (annotated := data.read_boxes(frame)) is not None:
         return annotated
     numbered = not data.has("boxes") and frame in data.frames_with("points", "instances")
     return tight_boxes(data.read_scan(frame) if numbered else Scan(np.empty((0, 3), np.float32)))

@@ -166,12 +166,8 @@ def render(
 
     renderers = [FrameRenderer(reader, camera, style.ego, color, boxes) for reader in readers]
     pictures = plan_cells(renderers, film)
-    shown = (
-        [cell.renderer.legend_of(cell.frame) for cells in pictures for cell in cells]
-        if style.legend
-        else []
-    )
-    entries = merge_legends(shown)
+    shown = [cell for cells in pictures for cell in cells]
+    entries = merge_legends(c.renderer.legend_of(c.frame) for c in shown if style.legend)
     sheet = replace(style.sheet, size=encodable_size(target, style.sheet.size))
     draw = partial(
         draw_shot,
@@ -193,7 +189,7 @@ def render(
         target,
         ", ".join(dict.fromkeys(reader.path for reader in readers)),
         readers[0].contents,
-        tuple(sorted({cell.frame for cells in pictures for cell in cells})),
+        tuple(sorted({cell.frame for cell in shown})),
         len(shots),
         sheet.size,
         readers[0].table.name,
