@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 
@@ -17,6 +18,7 @@ _STEPS = 10
 _HIGHEST_RAD = 0.21  # the last pitch is the first one at or above this angle
 
 
+@cache
 def rayiou_directions() -> FloatArray:
     """Return the directions of the rays that RayIoU casts from each origin (SparseOcc's evaluation
     script).
@@ -25,7 +27,7 @@ def rayiou_directions() -> FloatArray:
     12.55 degrees.
 
     Returns:
-        (14040, 3) float64 unit vectors, pitch by pitch.
+        (14040, 3) float64 unit vectors, pitch by pitch; read-only.
     """
     pitches = [math.atan(k) - math.pi / 2 for k in range(1, _STEPS + 1)]
     while pitches[-1] < _HIGHEST_RAD:
@@ -34,6 +36,7 @@ def rayiou_directions() -> FloatArray:
     directions = np.stack(
         [np.cos(pitch) * np.cos(azimuth), np.cos(pitch) * np.sin(azimuth), np.sin(pitch)], axis=-1
     )
+    directions.flags.writeable = False  # the same array in all calls
     return directions.reshape(-1, 3)
 
 

@@ -390,7 +390,7 @@ class RemappedSequence:
         Raises:
             FormatError: the scan does not have the format, or a label is not in its class table.
         """
-        scan = replace(without_invalid_points(self.sequence.scan(frame)), boxes=None)
+        scan = without_invalid_points(self.sequence.scan(frame, layout.point_fields()))
         if scan.labels is None:
             return scan
         where = f"{self.sequence.location}: labels, frame {frame}"
