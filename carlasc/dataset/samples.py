@@ -41,7 +41,7 @@ from carlasc.dataset.selection import (
     find_grid_name,
     find_grid_sequences,
 )
-from carlasc.errors import ArgumentError, FormatError, MissingDataError, count
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_choice, count
 from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.camera_files import image_fields
 from carlasc.storage.metadata import Axes
@@ -179,10 +179,7 @@ class Dataset(_MapStyle):
         self._grid_fields = GridFields(frozenset(self.fields), inferred, min_confidence)
         self.transform = transform
         coordinates = grid.coordinates if isinstance(grid, GridSpec) else coordinates
-        if coordinates not in layout.COORDINATES:
-            raise ArgumentError(
-                "coordinates", expected="cartesian or cylindrical", found=repr(coordinates)
-            )
+        check_choice("coordinates", coordinates, layout.COORDINATES)
 
         opened = as_source(source)
         chosen = choose_sequences(opened, split, coordinates)
@@ -464,10 +461,8 @@ class Dataset(_MapStyle):
 def _check_fields(fields: Iterable[str]) -> tuple[str, ...]:
     names = tuple(dict.fromkeys([fields] if isinstance(fields, str) else fields))
     known = (*FIELDS, *EVIDENCE_FIELDS, *ACTOR_FIELDS, *CAMERA_FIELDS)
-    unknown = [name for name in names if name not in (*known, *ALWAYS)]
-    if unknown:
-        expected = f"any of {', '.join(known)}"
-        raise ArgumentError("fields", expected=expected, found=", ".join(map(repr, unknown)))
+    for name in names:
+        check_choice("fields", name, (*known, *ALWAYS))
     chosen = tuple(name for name in names if name not in ALWAYS)
     if not chosen:
         raise ArgumentError("fields", expected=f"at least one of {', '.join(known)}", found="none")

@@ -128,12 +128,9 @@ def flip(sample: Sample, direction: str, spec: GridSpec | None) -> Sample:
         _check_symmetric(spec, direction)
         for name in _FIRST_GRID_AXIS.keys() & given.keys():
             flipped[name] = _flip_grid(given[name], _FIRST_GRID_AXIS[name], column, spec)
-    for name in {"points", "flow"} & given.keys():
-        flipped[name] = given[name].copy()
-        flipped[name][:, column] *= -1
-    if "voxel_flow" in flipped:
-        flipped["voxel_flow"] = flipped["voxel_flow"].copy()
-        flipped["voxel_flow"][..., column] *= -1
+    for name in {"points", "flow", "voxel_flow"} & given.keys():
+        flipped[name] = flipped[name].copy()
+        flipped[name][..., column] *= -1
     if "poses" in sample:
         mirror = np.eye(4)
         mirror[column, column] = -1

@@ -70,8 +70,10 @@ class ActorScores:
 
     def __init__(self, convention: Convention) -> None:
         self.convention = convention
-        things = movable_of(convention, convention.usual_truth)
-        k, free = convention.num_classes, convention.free
+        k, free, table = convention.num_classes, convention.free, convention.usual_truth
+        scored = set(convention.averaged) - {free}
+        mapping = convention.maps[table.name]
+        things = frozenset({mapping[i] for i in table.movable if i in mapping} & scored)
         self.panoptic = PanopticQuality(k, things, free=free)
         self.tracking = TrackingQuality(k, things, unaveraged={free})
         # sum of errors and number of voxels, by class and speed band
@@ -148,15 +150,6 @@ class ActorScores:
             {names[label]: float(by_class[label]) for label in sorted(self.panoptic.things)},
             dict(zip(SPEEDS_M_S, by_speed.tolist(), strict=True)),
         )
-
-
-def movable_of(convention: Convention, table: ClassTable) -> frozenset[int]:
-    """Return the classes of a convention to which the movable classes of a table are mapped."""
-    mapping = convention.maps[table.name]
-    actors = {mapping[label] for label in table.movable if label in mapping}
-    return frozenset(
-        label for label in actors if label in convention.averaged and label != convention.free
-    )
 
 
 def _dense(side: SequenceGrid, frame: int, size: tuple[int, ...]) -> Float32Array:

@@ -1,25 +1,16 @@
-"""Casting rays through voxel grids: the first occupied voxel on each ray and its distance.
-
-For arrays, compiled code walks ray by ray on the CPU. For torch tensors, all rays take one step at
-a time on the device of the tensors.
-"""
+"""Casting rays through voxel grids: the first occupied voxel on each ray and its distance."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from carlasc.core.arrays import AnyFloatArray, FloatArray, IntArray, LabelArray, Uint8Array
 from carlasc.core.compiling import cached, jit
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
-
-if TYPE_CHECKING:
-    import torch
-
 
 # number of pitches of the first part: for a sensor 1 m above flat ground, they hit it every metre
 # from 1 m to 10 m
@@ -27,6 +18,7 @@ _STEPS = 10
 _HIGHEST_RAD = 0.21  # the last pitch is the first one at or above this angle
 
 
+@cache
 def rayiou_directions() -> FloatArray:
     """Return the directions of the rays that RayIoU casts from each origin (SparseOcc's evaluation
     script).
@@ -35,7 +27,7 @@ def rayiou_directions() -> FloatArray:
     12.55 degrees.
 
     Returns:
-        (14040, 3) float64 unit vectors, pitch by pitch.
+        (14040, 3) float64 unit vectors, pitch by pitch; read-only.
     """
     pitches = [math.atan(k) - math.pi / 2 for k in range(1, _STEPS + 1)]
     while pitches[-1] < _HIGHEST_RAD:
@@ -44,6 +36,7 @@ def rayiou_directions() -> FloatArray:
     directions = np.stack(
         [np.cos(pitch) * np.cos(azimuth), np.cos(pitch) * np.sin(azimuth), np.sin(pitch)], axis=-1
     )
+    directions.flags.writeable = False  # the same array in all calls
     return directions.reshape(-1, 3)
 
 
@@ -77,10 +70,7 @@ def cast_rays(
     Raises:
         ArgumentError: the grid is cylindrical, or the shapes do not match.
     """
-    if spec.coordinates != "cartesian":
-        raise ArgumentError(
-            "grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates
-        )
+    _check_cartesian(spec)
     if grids.ndim != 4 or grids.shape[1:] != spec.size:
         raise ArgumentError(
             "grids", expected=f"shape (G, {', '.join(map(str, spec.size))})", found=str(grids.shape)
@@ -109,6 +99,13 @@ def cast_rays(
     return voxels, depth
 
 
+def _check_cartesian(spec: GridSpec) -> None:
+    if spec.coordinates != "cartesian":
+        raise ArgumentError(
+            "grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates
+        )
+
+
 def follow_rays(
     solid: Uint8Array,
     spec: GridSpec,
@@ -133,10 +130,7 @@ def follow_rays(
     Raises:
         ArgumentError: the grid is cylindrical.
     """
-    if spec.coordinates != "cartesian":
-        raise ArgumentError(
-            "grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates
-        )
+    _check_cartesian(spec)
     ends, lower, voxel = np.asarray(points, np.float64), np.array(spec.lower), spec.voxel_size
     first, passed = np.full(len(ends), np.inf), np.zeros(len(ends), np.uint8)
     start, size = (np.asarray(origin, np.float64) - lower) / voxel, np.array(spec.size)
@@ -273,60 +267,3 @@ def _entry(start, step, size):  # type: ignore[no-untyped-def]
         one, other = -start[axis] / step[axis], (size[axis] - start[axis]) / step[axis]
         near, far = max(near, min(one, other)), min(far, max(one, other))
     return near if near < far else -1.0
-
-
-def cast_rays_on_device(
-    grids: torch.Tensor, spec: GridSpec, origins: ArrayLike, directions: ArrayLike, *, free: int = 0
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Cast rays like `cast_rays`, on the device of the grids. Origins must be inside the grid.
-
-    Args:
-        grids: (G, X, Y, Z) integer tensor of class ids.
-        spec: geometry of the grids, Cartesian.
-        origins: (O, 3) metres, in the frame of the grid.
-        directions: (R, 3) unit vectors, in the frame of the grid.
-        free: the id of free space.
-
-    Returns:
-        (G, O * R) int64 flat voxel index of each ray, and (G, O * R) float64 distance in metres to
-        the point where the ray leaves it.
-    """
-    import torch
-
-    device, double = grids.device, torch.float64
-    voxel = spec.voxel_size
-    starts = torch.as_tensor(
-        (np.asarray(origins, np.float64) - np.array(spec.lower)) / voxel, device=device
-    )
-    steps = torch.as_tensor(np.asarray(directions, np.float64) / voxel, device=device)
-    start, step = starts.repeat_interleave(len(steps), dim=0), steps.repeat(len(starts), 1)
-    size = torch.tensor(spec.size, device=device)
-    strides = torch.tensor([spec.size[1] * spec.size[2], spec.size[2], 1], device=device)
-    solid = (grids != free).reshape(len(grids), -1)
-
-    cell = torch.minimum(start.floor().long().clamp(min=0), size - 1)
-    infinite = torch.full((), torch.inf, dtype=double, device=device)
-    to_face = torch.where(step != 0, (cell + (step > 0) - start) / step, infinite)
-    between = torch.where(step != 0, (1 / step).abs(), infinite)
-    sign = torch.where(step > 0, 1, -1)
-    voxels = torch.full((len(grids), len(start)), -1, dtype=torch.int64, device=device)
-    depth = torch.zeros(voxels.shape, dtype=double, device=device)
-    walking = torch.arange(len(start), device=device)
-    open_rays = torch.ones(voxels.shape, dtype=torch.bool, device=device)
-    while len(walking):
-        distance, axis = to_face[walking].min(dim=1)
-        flat = (cell[walking] * strides).sum(dim=1)
-        further = cell[walking].scatter_add(
-            1, axis[:, None], sign[walking].gather(1, axis[:, None])
-        )
-        leaves = ((further < 0) | (further >= size)).any(dim=1)
-        ends = (solid[:, flat] | leaves) & open_rays[:, walking]
-        for g in range(len(grids)):
-            rays = walking[ends[g]]
-            voxels[g, rays], depth[g, rays] = flat[ends[g]], distance[ends[g]]
-            open_rays[g, rays] = False
-        goes_on = open_rays[:, walking].any(dim=0) & ~leaves
-        walking, axis = walking[goes_on], axis[goes_on]
-        cell[walking] = further[goes_on]
-        to_face[walking, axis] += between[walking, axis]
-    return voxels, depth

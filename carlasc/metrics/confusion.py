@@ -13,11 +13,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from carlasc.core.arrays import AnyArray, AnyIntArray, BoolArray, FloatArray, IntArray
 from carlasc.core.compiling import cached
 from carlasc.core.grids import Grid
-from carlasc.errors import ArgumentError, FormatError
+from carlasc.errors import ArgumentError, FormatError, check_choice
+from carlasc.metrics.scoring import Summed
 
 if TYPE_CHECKING:
     import torch
@@ -46,7 +48,7 @@ class Completeness:
     iou: float
 
 
-class ConfusionMatrix:
+class ConfusionMatrix(Summed):
     """The number of voxels for each pair of true and predicted class.
 
     Attributes:
@@ -54,6 +56,8 @@ class ConfusionMatrix:
         free: the id of free space.
         counts: (K, K) int64, ground truth in rows, prediction in columns.
     """
+
+    _SETTINGS, _SUMS = ("num_classes", "free"), ("counts",)
 
     def __init__(
         self, num_classes: int, *, free: int = 0, counts: AnyIntArray | None = None
@@ -66,10 +70,7 @@ class ConfusionMatrix:
         """
         if num_classes < 1:
             raise ArgumentError("num_classes", expected="1 or more", found=str(num_classes))
-        if not 0 <= free < num_classes:
-            raise ArgumentError(
-                "free", expected=f"a class id in 0..{num_classes - 1}", found=str(free)
-            )
+        check_free(free, num_classes)
         if counts is not None and np.shape(counts) != (num_classes, num_classes):
             raise ArgumentError(
                 "counts",
@@ -120,30 +121,17 @@ class ConfusionMatrix:
         """Set all counts to zero."""
         self.counts[:] = 0
 
-    def merge(self, other: ConfusionMatrix) -> Self:
-        """Add the counts of another matrix; same as `+=`."""
-        return self.__iadd__(other)
-
     def compute(self) -> dict[str, float]:
         """Return the usual scores by name: `miou`, `accuracy`, and `precision`, `recall` and `iou`
         of occupied space.
         """
         return {"miou": self.miou, "accuracy": self.accuracy, **vars(self.completeness())}
 
-    def __iadd__(self, other: ConfusionMatrix) -> Self:
-        if (other.num_classes, other.free) != (self.num_classes, self.free):
-            raise ArgumentError(
-                "confusion matrix",
-                expected=f"{self.num_classes} classes with free {self.free}",
-                found=f"{other.num_classes} classes with free {other.free}",
-            )
-        self.counts += other.counts
-        return self
+    def __iadd__(self, other: Self) -> Self:
+        return self.merge(other)
 
     def __add__(self, other: ConfusionMatrix) -> ConfusionMatrix:
-        total = ConfusionMatrix(self.num_classes, free=self.free, counts=self.counts)
-        total += other
-        return total
+        return ConfusionMatrix(self.num_classes, free=self.free, counts=self.counts).merge(other)
 
     def __eq__(self, other: object) -> bool:
         return (
@@ -221,7 +209,7 @@ class ConfusionMatrix:
         Raises:
             ArgumentError: `absent` has another value.
         """
-        check_absent(absent)
+        check_choice("absent", absent, Absent)
         iou = self.iou if with_free else np.delete(self.iou, self.free)
         iou = np.nan_to_num(iou) if absent == "zero" else iou[~np.isnan(iou)]
         return float(iou.mean()) if len(iou) else float("nan")
@@ -243,14 +231,10 @@ class ConfusionMatrix:
         )
 
 
-def check_absent(absent: str) -> None:
-    """Check a value of `absent`.
-
-    Raises:
-        ArgumentError: it is not "zero" or "skip".
-    """
-    if absent not in ("zero", "skip"):
-        raise ArgumentError("absent", expected="zero or skip", found=repr(absent))
+def check_free(free: int, num_classes: int) -> None:
+    """Raise ArgumentError if the id of free space is not in 0..K-1."""
+    if not 0 <= free < num_classes:
+        raise ArgumentError("free", expected=f"a class id in 0..{num_classes - 1}", found=str(free))
 
 
 def ratio(numerator: Any, denominator: Any) -> FloatArray:
@@ -391,21 +375,20 @@ def count_tensors(
     """
     import torch
 
-    def on_device(array: Labels) -> torch.Tensor:
-        if not isinstance(array, torch.Tensor):
-            array = torch.from_numpy(np.asarray(array).astype(np.int64))
-        return array.to(device).reshape(-1)
+    def flat(array: Labels) -> torch.Tensor:
+        return torch.as_tensor(array, device=device).reshape(-1)
 
-    ids = {"prediction": on_device(prediction), "truth": on_device(truth)}
-    for name, labels in ids.items():
-        if labels.is_floating_point() or labels.is_complex():
-            raise FormatError(name, expected="integer class ids", found=str(labels.dtype))
-        counted = labels.long() if mask is None else labels.long()[on_device(mask).bool()]
-        wrong = counted[(counted < 0) | (counted >= num_classes)]
-        if wrong.numel():
-            raise _out_of_range(name, int(wrong[0]), wrong.numel(), num_classes)
-        ids[name] = counted
-    pairs = torch.bincount(ids["truth"] * num_classes + ids["prediction"], minlength=num_classes**2)
+    predicted, true = flat(prediction), flat(truth)
+    if mask is not None:
+        counted = flat(mask).bool()
+        predicted, true = predicted[counted], true[counted]
+    for ids in (predicted, true):
+        whole = not (ids.is_floating_point() or ids.is_complex())
+        if not whole or (ids.numel() and (ids.min() < 0 or ids.max() >= num_classes)):
+            known = None if mask is None else to_numpy(mask)
+            # raises the error that names the id
+            return count_arrays(to_numpy(prediction), to_numpy(truth), known, num_classes)
+    pairs = torch.bincount(true.long() * num_classes + predicted.long(), minlength=num_classes**2)
     return pairs.reshape(num_classes, num_classes).cpu().numpy()
 
 
@@ -445,11 +428,43 @@ def _count_pairs(
 
 
 def check_ids(name: str, ids: AnyArray, num_classes: int) -> None:
-    """Raise FormatError if class ids, of any shape, are not all in 0..K-1."""
-    if ids.size and (ids.min() < 0 or ids.max() >= num_classes):
+    """Raise FormatError if class ids, of any shape, are not integers in 0..K-1."""
+    if ids.dtype.kind not in "uib" or (ids.size and (ids.min() < 0 or ids.max() >= num_classes)):
+        found = f"{ids.dtype} from {ids.min()} to {ids.max()}" if ids.size else str(ids.dtype)
+        raise FormatError(name, expected=f"class ids 0..{num_classes - 1}", found=found)
+
+
+def flat_sides(
+    prediction: tuple[ArrayLike, ArrayLike],
+    truth: tuple[ArrayLike, ArrayLike],
+    mask: ArrayLike | None,
+    num_classes: int,
+) -> list[AnyArray]:
+    """Return class ids and instance ids of the prediction, then those of the ground truth, of the
+    scored elements, (N,) each.
+
+    Args:
+        prediction: class ids and instance ids, of equal shape.
+        truth: true class ids and instance ids, of the same shape.
+        mask: the same shape, bool: the scored elements; None for all.
+        num_classes: K.
+
+    Raises:
+        FormatError: shapes differ, or a class id is not below K.
+    """
+    arrays = [to_numpy(array).reshape(-1) for side in (prediction, truth) for array in side]
+    if len({array.shape for array in arrays}) > 1:
         raise FormatError(
-            name, expected=f"class ids 0..{num_classes - 1}", found=f"{ids.min()} to {ids.max()}"
+            "prediction",
+            expected="classes and instances with the shape of the ground truth",
+            found=" and ".join(str(array.shape) for array in arrays),
         )
+    if mask is not None:
+        counted = to_numpy(mask).astype(np.bool_).reshape(-1)
+        arrays = [array[counted] for array in arrays]
+    check_ids("prediction", arrays[0], num_classes)
+    check_ids("truth", arrays[2], num_classes)
+    return arrays
 
 
 def _out_of_range(name: str, found: int, times: int, num_classes: int) -> FormatError:

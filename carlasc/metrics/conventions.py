@@ -152,28 +152,6 @@ class Convention:
         true[true == _LEFT_OUT] = self.free
         return pred, true, counted
 
-    def count(
-        self,
-        prediction: tuple[AnyArray, ClassTable],
-        truth: tuple[AnyArray, ClassTable],
-        known: BoolArray | None,
-        region: BoolArray | None = None,
-    ) -> ConfusionMatrix:
-        """Return the confusion matrix of a frame in the scored classes.
-
-        Args:
-            prediction: predicted labels, shape (X, Y, Z), and their class table.
-            truth: true labels of the same shape, and their class table.
-            known: known voxels of the ground truth, bool, same shape; None for all.
-            region: voxels to score, bool, same shape; None for all.
-
-        Raises:
-            FormatError: an id has no target.
-        """
-        return ConfusionMatrix(self.num_classes, free=self.free).update(
-            *self.prepare(prediction, truth, known, region)
-        )
-
     def score(self, matrix: ConfusionMatrix) -> ConventionScore:
         """Return the scores of a confusion matrix, which may be a sum over many frames."""
         union = matrix.true_positives + matrix.false_positives + matrix.false_negatives
@@ -195,10 +173,8 @@ class Convention:
         return ConventionScore(
             float(values.mean()) if len(values) else float("nan"),
             dict(zip(names, iou.tolist(), strict=True)),
-            occupied.precision,
-            occupied.recall,
-            occupied.iou,
-            1 - occupied.recall,
+            **vars(occupied),
+            false_free=1 - occupied.recall,
         )
 
     def _map(self, labels: AnyArray, table: ClassTable, where: str) -> Uint8Array:

@@ -60,31 +60,27 @@ class Scorer:
         self.convention = _resolve(convention, pairs)
         given = None if source_classes is None else table_named(source_classes)
         self.tables: dict[str, tuple[ClassTable, ClassTable]] = {}
-        self.matrices: dict[str, ConfusionMatrix] = {}
-        self.failures: list[tuple[str, str]] = []
-        self.frames: list[FrameScore] = []
-        self.breakdown = Breakdown(self.convention.num_classes, free=self.convention.free)
-        self.rays = (
-            RayIoU(self.convention.num_classes, free=self.convention.free) if scoring.rays else None
-        )
-        self.actors = ActorScores(self.convention) if scoring.actors else None
         try:
             for pair in pairs:
                 self.tables[pair.truth.path] = self._check(pair, given)
-                self.matrices[pair.truth.path] = self._matrix()
         except CarlascError as error:
             self.impossible = error
+        self.reset()
+
+    def reset(self) -> None:
+        """Set all sums to zero."""
+        classes, free = self.convention.num_classes, self.convention.free
+        self.matrices = {path: self._matrix() for path in self.tables}
+        self.failures: list[tuple[str, str]] = []
+        self.frames: list[FrameScore] = []
+        self.breakdown = Breakdown(classes, free=free)
+        self.rays = RayIoU(classes, free=free) if self.scoring.rays else None
+        self.actors = ActorScores(self.convention) if self.scoring.actors else None
 
     def empty(self) -> Scorer:
         """Return an empty scorer with the same rules."""
         other = copy(self)
-        other.matrices = {path: self._matrix() for path in self.matrices}
-        other.failures, other.frames = [], []
-        other.breakdown = Breakdown(self.convention.num_classes, free=self.convention.free)
-        other.rays = copy(self.rays)
-        if other.rays is not None:
-            other.rays.reset()
-        other.actors = ActorScores(self.convention) if self.scoring.actors else None
+        other.reset()
         return other
 
     def merge(self, other: Scorer) -> None:
@@ -165,11 +161,8 @@ class Scorer:
             )
         if self.scoring.actors:
             ActorScores.check(pair)
-        for argument, asked in (
-            ("region", self.scoring.region),
-            ("by", self.scoring.by),
-            ("rays", self.scoring.rays),
-        ):
+        for argument in ("region", "by", "rays"):
+            asked = getattr(self.scoring, argument)
             if asked and pair.spec is None:
                 raise ArgumentError(
                     argument,
@@ -194,16 +187,13 @@ class Scorer:
         if self.scoring.region is not None and spec is not None:
             region = self.scoring.region(spec).reshape(truth.shape)
         try:
-            matrix = self.convention.count(
+            pred, true, counted = self.convention.prepare(
                 (prediction, tables[0]), (truth, tables[1]), known, region
             )
+            matrix = self._matrix().update(pred, true, counted)
             if (self.scoring.by or self.scoring.rays or self.scoring.actors) and spec is not None:
-                pred, true, counted = self.convention.prepare(
-                    (prediction.reshape(spec.size), tables[0]),
-                    (truth.reshape(spec.size), tables[1]),
-                    known,
-                    region,
-                )
+                pred, true = pred.reshape(spec.size), true.reshape(spec.size)
+                counted = counted.reshape(spec.size)
                 if self.actors is not None:
                     self.actors.update(pair, frame, (pred, true, counted))
                 for masks in self._masks(pair, frame, spec, true, known, tables[1]):

@@ -33,7 +33,7 @@ class FutureGrid(GridFrames):
     forecast is made.
     """
 
-    def __init__(self, grid: SequenceGrid, horizon_s: float, around: Around) -> None:
+    def __init__(self, grid: GridFrames, horizon_s: float, around: Around) -> None:
         """Find the later frame of each frame.
 
         Args:
@@ -43,9 +43,13 @@ class FutureGrid(GridFrames):
                 the later frame ("future").
 
         Raises:
-            MissingDataError: no frame has a later frame, or poses to move it to the present are
-                missing.
+            MissingDataError: the grids have no sequence, no frame has a later frame, or poses to
+                move it to the present are missing.
         """
+        if not isinstance(grid, SequenceGrid):
+            raise MissingDataError(
+                grid.location, expected="a sequence with poses and times", found="files of grids"
+            )
         self.grid, self.around = grid, around
         self.path, self.location = grid.path, grid.location
         self.spec, self.classes = grid.spec, grid.classes
@@ -148,7 +152,7 @@ def evaluate_forecasts(
     results = {}
     for horizon_s, name in _horizons(source, grid).items():
         pairs, notes = pair_grids(source, truth, name, truth_grid)
-        pairs = [Pair(pair.prediction, _future(pair.truth, horizon_s, around)) for pair in pairs]
+        pairs = [Pair(pair.prediction, FutureGrid(pair.truth, horizon_s, around)) for pair in pairs]
         results[horizon_s] = score_pairs(
             pairs, convention, source_classes, scoring, frames, f"{horizon_s:g} s", run, notes
         )
@@ -182,11 +186,3 @@ def _horizons(source: Place, grid: str | None) -> dict[float, str]:
             opened.location, expected=expected, found=", ".join(names) or "no grid"
         )
     return dict(sorted(tokens.items()))
-
-
-def _future(truth: GridFrames, horizon_s: float, around: Around) -> FutureGrid:
-    if not isinstance(truth, SequenceGrid):
-        raise MissingDataError(
-            truth.location, expected="a sequence with poses and times", found="files of grids"
-        )
-    return FutureGrid(truth, horizon_s, around)

@@ -170,13 +170,10 @@ def _read(file: Path) -> dict[str, Any]:
             expected="a result of `carlasc evaluate --json`",
             found=f"JSON without {', '.join(missing[:3])}",
         )
-    for key in ("name", "convention"):
-        if not isinstance(values[key], str):
-            raise FormatError(file, expected=f"text under {key}", found=type(values[key]).__name__)
-    if not isinstance(values["class_iou"], dict):
-        raise FormatError(
-            file, expected="an IoU by class", found=type(values["class_iou"]).__name__
-        )
+    for key, kind in {"name": str, "convention": str, "class_iou": dict}.items():
+        if not isinstance(values[key], kind):
+            found = type(values[key]).__name__
+            raise FormatError(file, expected=f"a {kind.__name__} under {key}", found=found)
     figures = {figure: values.get(figure) for figure in (*_FIGURES, "rayiou")} | values["class_iou"]
     for name, value in figures.items():
         if value is not None and not (isinstance(value, int | float) and 0 <= value <= 1):

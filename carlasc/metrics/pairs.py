@@ -222,9 +222,7 @@ def pair_grids(
     if len(predictions) == len(truths) == 1:
         pairs = [Pair(predictions[0], next(iter(truths.values())))]
     else:
-        pairs = []
-        for prediction in predictions:
-            pairs.append(Pair(prediction, _truth_of(prediction, truths)))
+        pairs = [Pair(prediction, _truth_of(prediction, truths)) for prediction in predictions]
     for pair in pairs:
         if (
             isinstance(pair.prediction, KittiFolder)

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from carlasc.core.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from carlasc.core.compiling import cached
-from carlasc.errors import ArgumentError, FormatError
-from carlasc.metrics.confusion import check_ids, ratio, to_numpy
+from carlasc.errors import ArgumentError, check_choice
+from carlasc.metrics.confusion import flat_sides, ratio
 from carlasc.metrics.scoring import Summed
 
 Variant = Literal["standard", "pasco"]
@@ -115,8 +115,7 @@ class PanopticQuality(Summed):
         free: int = 0,
         variant: Variant = "standard",
     ) -> None:
-        if variant not in ("standard", "pasco"):
-            raise ArgumentError("variant", expected="standard or pasco", found=repr(variant))
+        check_choice("variant", variant, Variant)
         if not 0 <= free < num_classes or any(
             not 0 <= thing < num_classes or thing == free for thing in things
         ):
@@ -153,22 +152,10 @@ class PanopticQuality(Summed):
         Raises:
             FormatError: shapes differ, or an id is not below `num_classes`.
         """
-        sides = []
-        for name, side in (("prediction", prediction), ("truth", truth)):
-            classes, ids = (to_numpy(array).reshape(-1) for array in side)
-            if classes.shape != ids.shape or classes.shape != to_numpy(truth[0]).reshape(-1).shape:
-                raise FormatError(
-                    name,
-                    expected="classes and instances with the shape of the ground truth",
-                    found=f"{classes.shape} and {ids.shape}",
-                )
-            sides.append((classes, ids))
-        counted = None if mask is None else to_numpy(mask).astype(np.bool_).reshape(-1)
-        if counted is not None:
-            sides = [(classes[counted], ids[counted]) for classes, ids in sides]
-        for name, (classes, _) in zip(("prediction", "truth"), sides, strict=True):
-            check_ids(name, classes, self.num_classes)
-        self.add(match_segments(*sides, things=self.things, free=self.free))
+        pred, pred_ids, true, true_ids = flat_sides(prediction, truth, mask, self.num_classes)
+        self.add(
+            match_segments((pred, pred_ids), (true, true_ids), things=self.things, free=self.free)
+        )
         return self
 
     def add(self, segments: Segments, *, fewest: int = 0) -> None:

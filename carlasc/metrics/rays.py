@@ -9,21 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from carlasc.core.arrays import AnyArray, AnyFloatArray, FloatArray, IntArray
+from carlasc.core.arrays import AnyArray, FloatArray, IntArray
 from carlasc.core.geometry import Transform, invert
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.metrics.casting import cast_rays, cast_rays_on_device, rayiou_directions
-from carlasc.metrics.confusion import device_of, ratio, to_numpy
+from carlasc.metrics.casting import cast_rays, rayiou_directions
+from carlasc.metrics.confusion import check_free, check_ids, ratio, to_numpy
 from carlasc.metrics.panoptic import PanopticQuality, PanopticScore, match_segments
 from carlasc.metrics.scoring import Summed
 
-THRESHOLDS_M = (1.0, 2.0, 4.0)
+THRESHOLDS_M = (1.0, 2.0, 4.0)  # between the distances of a correct ray
 _MOST_ORIGINS = 8
 # minimum distance of origins from the sides of the grid: up to 39 m in the grid of Occ3D, which
 # ends at 40 m
@@ -61,19 +61,17 @@ class RayScore:
     Attributes:
         class_iou: (T, K) IoU of each class at each depth threshold; NaN for classes that do not
             occur in prediction or ground truth.
-        thresholds_m: (T,) metres.
         free: id of free space, which is not scored.
     """
 
     class_iou: FloatArray
-    thresholds_m: tuple[float, ...]
     free: int
 
     @property
     def by_threshold(self) -> dict[float, float]:
         """RayIoU by threshold, metres: the mean over the occurring classes except free."""
         things = np.delete(self.class_iou, self.free, axis=1)
-        return {t: _mean(row) for t, row in zip(self.thresholds_m, things, strict=True)}
+        return {t: _mean(row) for t, row in zip(THRESHOLDS_M, things, strict=True)}
 
     @property
     def rayiou(self) -> float:
@@ -91,13 +89,12 @@ class RayIoU(Summed):
     Attributes:
         num_classes: K; ids are 0..K-1.
         free: id of free space.
-        thresholds_m: maximum differences of distances, metres.
         skip_unknown: leave out rays that cross an unknown voxel before the first surface of the
             ground truth. In the original metric, unknown voxels count as free.
     """
 
     _SETTINGS, _SUMS = (
-        ("num_classes", "free", "thresholds_m", "skip_unknown"),
+        ("num_classes", "free", "skip_unknown"),
         ("true", "predicted", "hits"),
     )
 
@@ -106,7 +103,6 @@ class RayIoU(Summed):
         num_classes: int,
         *,
         free: int = 0,
-        thresholds_m: tuple[float, ...] = THRESHOLDS_M,
         skip_unknown: bool = False,
         directions: ArrayLike | None = None,
     ) -> None:
@@ -114,10 +110,8 @@ class RayIoU(Summed):
 
         `directions` are (R, 3) unit vectors of the rays; None takes `rayiou_directions`.
         """
-        if not 0 <= free < num_classes:
-            raise ArgumentError("free", expected=f"a class id below {num_classes}", found=str(free))
-        self.num_classes, self.free, self.thresholds_m = num_classes, free, tuple(thresholds_m)
-        self.skip_unknown = skip_unknown
+        check_free(free, num_classes)
+        self.num_classes, self.free, self.skip_unknown = num_classes, free, skip_unknown
         self.directions = (
             rayiou_directions() if directions is None else np.asarray(directions, np.float64)
         )
@@ -127,7 +121,7 @@ class RayIoU(Summed):
         """Set all sums to zero."""
         self.true = np.zeros(self.num_classes, np.int64)
         self.predicted = np.zeros(self.num_classes, np.int64)
-        self.hits = np.zeros((len(self.thresholds_m), self.num_classes), np.int64)
+        self.hits = np.zeros((len(THRESHOLDS_M), self.num_classes), np.int64)
 
     def update(
         self,
@@ -140,8 +134,7 @@ class RayIoU(Summed):
         """Add a frame.
 
         Args:
-            prediction: (X, Y, Z) class ids, NumPy or a torch tensor; rays are cast on the device of
-                a tensor.
+            prediction: (X, Y, Z) class ids, NumPy or a torch tensor.
             truth: (X, Y, Z) class ids, NumPy or a torch tensor.
             spec: geometry of both, Cartesian.
             origins: (O, 3) ray origins, metres, in the frame of the grid (see `ray_origins`).
@@ -155,8 +148,7 @@ class RayIoU(Summed):
             ArgumentError: the grid is cylindrical, or `skip_unknown` is set and `known` is missing.
         """
         pred, true = self._check(prediction, "prediction", spec), self._check(truth, "truth", spec)
-        device = device_of(prediction, truth)
-        grids = [pred, true]
+        further = []
         if self.skip_unknown:
             if known is None:
                 raise ArgumentError(
@@ -164,56 +156,28 @@ class RayIoU(Summed):
                 )
             seen = np.asarray(known, np.bool_)
             # unknown voxels stop a ray here
-            grids.append(np.where(seen, true, self.num_classes).astype(np.uint16))
-        voxels, depths = self._cast(np.stack(grids), spec, np.asarray(origins), device)
-        valid = voxels[1] >= 0
-        if self.skip_unknown:
-            valid &= voxels[2] == voxels[1]
-        flat_pred, flat_true = pred.reshape(-1)[voxels[0]], true.reshape(-1)[voxels[1]]
-        valid &= flat_true != self.free
-        flat_pred, flat_true = flat_pred[valid], flat_true[valid]
-        off = np.abs(depths[0] - depths[1])[valid]
+            further.append(np.where(seen, true, self.num_classes).astype(np.uint16))
+        near, far, off = _first_surfaces([pred, true, *further], spec, origins, self)
+        flat_pred, flat_true = pred.reshape(-1)[near], true.reshape(-1)[far]
         self.true += np.bincount(flat_true, minlength=self.num_classes)
         self.predicted += np.bincount(flat_pred, minlength=self.num_classes)
         same = flat_pred == flat_true
-        for row, threshold in enumerate(self.thresholds_m):
+        for row, threshold in enumerate(THRESHOLDS_M):
             self.hits[row] += np.bincount(
                 flat_true[same & (off < threshold)], minlength=self.num_classes
             )
         return self
 
-    def _cast(
-        self, grids: AnyArray, spec: GridSpec, origins: AnyFloatArray, device: Any
-    ) -> tuple[IntArray, FloatArray]:
-        """Cast the rays on the device of the given tensors, or on the CPU in compiled code."""
-        if device is None:
-            return cast_rays(grids, spec, origins, self.directions, free=self.free)
-        import torch
-
-        on_device = torch.from_numpy(grids.astype(np.int32)).to(device)
-        voxels, depths = cast_rays_on_device(
-            on_device, spec, origins, self.directions, free=self.free
-        )
-        return voxels.cpu().numpy(), depths.cpu().numpy()
-
     def compute(self) -> RayScore:
         """Return the score of all added frames."""
         iou = ratio(self.hits, self.true + self.predicted - self.hits)
-        return RayScore(iou, self.thresholds_m, self.free)
+        return RayScore(iou, self.free)
 
     def _check(self, labels: ArrayLike, name: str, spec: GridSpec) -> AnyArray:
         array = to_numpy(labels)
         if array.shape != spec.size:
             raise FormatError(name, expected=f"shape {spec.size}", found=str(array.shape))
-        if array.dtype.kind not in "ui" or (
-            array.size and (array.min() < 0 or array.max() >= self.num_classes)
-        ):
-            found = (
-                f"{array.dtype} from {array.min()} to {array.max()}"
-                if array.size
-                else str(array.dtype)
-            )
-            raise FormatError(name, expected=f"class ids 0..{self.num_classes - 1}", found=found)
+        check_ids(name, array, self.num_classes)
         return array.astype(np.uint16, copy=False)
 
 
@@ -232,19 +196,13 @@ class RayPQ:
         things: frozenset[int],
         *,
         free: int = 0,
-        thresholds_m: tuple[float, ...] = THRESHOLDS_M,
         directions: ArrayLike | None = None,
     ) -> None:
         """Create an empty metric.
 
         `directions` are (R, 3) unit vectors of the rays; None takes `rayiou_directions`.
         """
-        self.num_classes, self.things, self.free, self.thresholds_m = (
-            num_classes,
-            things,
-            free,
-            tuple(thresholds_m),
-        )
+        self.num_classes, self.things, self.free = num_classes, things, free
         self.directions = (
             rayiou_directions() if directions is None else np.asarray(directions, np.float64)
         )
@@ -252,10 +210,10 @@ class RayPQ:
 
     def reset(self) -> None:
         """Set all sums to zero."""
-        self.qualities = [
-            PanopticQuality(self.num_classes, self.things, free=self.free)
-            for _ in self.thresholds_m
-        ]
+        self.qualities = {
+            threshold: PanopticQuality(self.num_classes, self.things, free=self.free)
+            for threshold in THRESHOLDS_M
+        }
 
     def update(
         self,
@@ -275,16 +233,11 @@ class RayPQ:
         (pred, pred_ids), (true, true_ids) = (
             [to_numpy(a) for a in side] for side in (prediction, truth)
         )
-        voxels, depths = cast_rays(
-            np.stack([pred, true]), spec, np.asarray(origins), self.directions, free=self.free
-        )
-        valid = (voxels[1] >= 0) & (true.reshape(-1)[voxels[1]] != self.free)
-        near, far = voxels[0][valid], voxels[1][valid]
+        near, far, off = _first_surfaces([pred, true], spec, origins, self)
         classes = pred.reshape(-1)[near], true.reshape(-1)[far]
         is_thing = np.isin(classes[1], sorted(self.things))
         ids = pred_ids.reshape(-1)[near], np.where(is_thing, true_ids.reshape(-1)[far], 0)
-        off = np.abs(depths[0] - depths[1])[valid]
-        for quality, threshold in zip(self.qualities, self.thresholds_m, strict=True):
+        for threshold, quality in self.qualities.items():
             segments = match_segments(
                 (classes[0], ids[0]), (classes[1], ids[1]), overlap=off < threshold, free=self.free
             )
@@ -295,10 +248,7 @@ class RayPQ:
         """Return the panoptic score at each depth threshold, metres; RayPQ is the mean of their
         `pq`.
         """
-        return {
-            t: quality.compute()
-            for t, quality in zip(self.thresholds_m, self.qualities, strict=True)
-        }
+        return {threshold: quality.compute() for threshold, quality in self.qualities.items()}
 
     def merge(self, other: RayPQ) -> Self:
         """Add the sums of another metric with the same settings.
@@ -306,9 +256,30 @@ class RayPQ:
         Raises:
             ArgumentError: its settings differ.
         """
-        for own, theirs in zip(self.qualities, other.qualities, strict=True):
-            own.merge(theirs)
+        for threshold, quality in self.qualities.items():
+            quality.merge(other.qualities[threshold])
         return self
+
+
+def _first_surfaces(
+    grids: list[AnyArray], spec: GridSpec, origins: ArrayLike, metric: RayIoU | RayPQ
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return the first voxel of the prediction and of the ground truth on each ray with a surface
+    in the ground truth, and the difference of their distances, metres.
+
+    Args:
+        grids: class ids of the prediction and of the ground truth; a third grid drops rays whose
+            first voxel is another one in it than in the ground truth.
+        spec: geometry of the grids.
+        origins: (O, 3) metres.
+        metric: has the directions of the rays and the id of free space.
+    """
+    voxels, depths = cast_rays(
+        np.stack(grids), spec, np.asarray(origins), metric.directions, free=metric.free
+    )
+    valid = (voxels[1] >= 0) & (grids[1].reshape(-1)[voxels[1]] != metric.free)
+    valid &= voxels[-1] == voxels[1] if len(grids) > 2 else True
+    return voxels[0][valid], voxels[1][valid], np.abs(depths[0] - depths[1])[valid]
 
 
 def _mean(values: FloatArray) -> float:

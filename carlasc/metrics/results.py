@@ -28,6 +28,7 @@ from carlasc.metrics.rays import RayScore
 Cell = str | float
 Score = Callable[[ConfusionMatrix], float]
 _FEWEST_SEQUENCES = 5
+_LEVEL = 0.95  # of confidence
 _DRAWS, _SEED, _EXACT = 2000, 0, 12  # fact: draws
 
 
@@ -160,15 +161,13 @@ class Evaluation:
         values = [0.0 if math.isnan(v) else v for name, v in self.class_iou.items() if name != free]
         return sum(values) / len(values) if values else math.nan
 
-    def interval(self, level: float = 0.95) -> Interval | None:
+    def interval(self) -> Interval | None:
         """Return the confidence interval of `miou` by bootstrap over sequences; None for fewer than
         five sequences.
         """
         if len(self.sequences) < _FEWEST_SEQUENCES:
             return None
-        return bootstrap(
-            list(self.sequences.values()), lambda m: self.convention.score(m).miou, level=level
-        )
+        return bootstrap(list(self.sequences.values()), lambda m: self.convention.score(m).miou)
 
     def compare(self, other: Evaluation) -> Comparison:
         """Compare with other predictions of the same sequences by a paired test.
@@ -317,19 +316,17 @@ def _percent(*values: float) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class Interval:
-    """A confidence interval.
+    """A confidence interval of 95 %.
 
     Attributes:
         value: the score over all sequences.
         low: lower bound.
         high: upper bound.
-        level: confidence level, such as 0.95.
     """
 
     value: float
     low: float
     high: float
-    level: float
 
 
 @dataclass(frozen=True)
@@ -356,33 +353,30 @@ class Comparison:
         }
 
 
-def bootstrap(
-    matrices: Sequence[ConfusionMatrix], score: Score, *, level: float = 0.95
-) -> Interval:
+def bootstrap(matrices: Sequence[ConfusionMatrix], score: Score) -> Interval:
     """Return a score with its confidence interval by bootstrap: sequences are resampled with
     replacement.
 
     Args:
         matrices: confusion matrix of each sequence.
         score: function that computes the score from the sum of the matrices.
-        level: confidence level of the interval.
 
     Raises:
         ArgumentError: fewer than five sequences are given.
     """
-    _checkjson_number(len(matrices))
+    _check_number(len(matrices))
     counts = np.stack([matrix.counts for matrix in matrices])
     draws = np.random.default_rng(_SEED).integers(0, len(counts), (_DRAWS, len(counts)))
-    values = [score(_matrix(counts[draw].sum(axis=0), matrices[0])) for draw in draws]
-    return _interval(score(_matrix(counts.sum(axis=0), matrices[0])), values, level)
+    value, *values = (
+        score(_matrix(counts[rows].sum(axis=0), matrices[0])) for rows in (slice(None), *draws)
+    )
+    return _interval(value, values)
 
 
 def compare(
     first: Mapping[str, ConfusionMatrix],
     second: Mapping[str, ConfusionMatrix],
     score: Score,
-    *,
-    level: float = 0.95,
 ) -> Comparison:
     """Compare two predictions, sequence by sequence.
 
@@ -395,7 +389,6 @@ def compare(
         second: confusion matrix of each sequence of the second prediction, by path. Only common
             sequences are used.
         score: function that computes the score from a sum of matrices.
-        level: confidence level of the interval.
 
     Raises:
         MissingDataError: no sequence is common.
@@ -406,7 +399,7 @@ def compare(
         raise MissingDataError(
             "second", expected="sequences of the first", found=", ".join(sorted(second)) or "none"
         )
-    _checkjson_number(len(common))
+    _check_number(len(common))
     like = first[common[0]]
     a, b = (np.stack([side[path].counts for path in common]) for side in (first, second))
 
@@ -430,10 +423,10 @@ def compare(
         for s in swaps
     ]
     p_value = float(np.mean(np.abs(swapped) >= abs(observed) - 1e-12))
-    return Comparison(_interval(observed, spread, level), p_value, common)
+    return Comparison(_interval(observed, spread), p_value, common)
 
 
-def _checkjson_number(sequences: int) -> None:
+def _check_number(sequences: int) -> None:
     if sequences < _FEWEST_SEQUENCES:
         raise ArgumentError(
             "sequences",
@@ -446,9 +439,8 @@ def _matrix(counts: IntArray, like: ConfusionMatrix) -> ConfusionMatrix:
     return ConfusionMatrix(like.num_classes, free=like.free, counts=counts)
 
 
-def _interval(value: float, draws: Sequence[float], level: float) -> Interval:
-    present = np.array(draws)[~np.isnan(draws)]
-    if not len(present):
-        return Interval(value, float("nan"), float("nan"), level)
-    low, high = np.quantile(present, [(1 - level) / 2, (1 + level) / 2])
-    return Interval(value, float(low), float(high), level)
+def _interval(value: float, draws: Sequence[float]) -> Interval:
+    if np.isnan(draws).all():
+        return Interval(value, math.nan, math.nan)
+    low, high = np.nanquantile(draws, [(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
+    return Interval(value, float(low), float(high))

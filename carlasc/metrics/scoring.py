@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 from carlasc.core.arrays import BoolArray
 from carlasc.core.choices import Voxels as Voxels  # noqa: PLC0414 (part of this module)
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, check_choice
 
 Region = Callable[[GridSpec], BoolArray]
 BREAKDOWNS = ("distance", "height", "visibility", "motion", "seen")
@@ -43,12 +43,9 @@ class Scoring:
     actors: bool = False
 
     def __post_init__(self) -> None:
-        if self.voxels not in ("known", "all"):
-            raise ArgumentError("voxels", expected="known or all", found=repr(self.voxels))
-        if unknown := [name for name in self.by if name not in BREAKDOWNS]:
-            raise ArgumentError(
-                "by", expected=f"any of {', '.join(BREAKDOWNS)}", found=repr(unknown[0])
-            )
+        check_choice("voxels", self.voxels, Voxels)
+        for name in self.by:
+            check_choice("by", name, BREAKDOWNS)
 
 
 class Summed:

@@ -16,7 +16,7 @@ from carlasc.core.arrays import BoolArray, IntArray
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import Grid
 from carlasc.errors import FormatError
-from carlasc.metrics.confusion import ConfusionMatrix, check_ids, ratio, to_numpy
+from carlasc.metrics.confusion import ConfusionMatrix, flat_sides, ratio
 from carlasc.metrics.scoring import Summed
 
 
@@ -216,22 +216,8 @@ class TrackingQuality(Summed):
         Raises:
             FormatError: shapes differ, or a class id is not below `num_classes`.
         """
-        arrays = [to_numpy(array).reshape(-1) for side in (prediction, truth) for array in side]
-        if len({array.shape for array in arrays}) > 1:
-            found = " and ".join(str(array.shape) for array in arrays)
-            raise FormatError(
-                "prediction",
-                expected="classes and numbers with the shape of the ground truth",
-                found=found,
-            )
-        for name, classes in (("prediction", arrays[0]), ("truth", arrays[2])):
-            check_ids(name, classes, self.num_classes)
-        counted = (
-            np.ones(len(arrays[0]), np.bool_)
-            if mask is None
-            else to_numpy(mask).astype(np.bool_).reshape(-1)
-        )
-        counted = counted & ~np.isin(arrays[2], sorted(self.ignored))
+        arrays = flat_sides(prediction, truth, mask, self.num_classes)
+        counted = ~np.isin(arrays[2], sorted(self.ignored))
         pred_class, pred, true_class, true = (array[counted].astype(np.int64) for array in arrays)
         k = self.num_classes
         self.confusion += np.bincount(pred_class * k + true_class, minlength=k * k).reshape(k, k)

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from carlasc.core.arrays import FloatArray, IntArray
-from carlasc.errors import ArgumentError, FormatError
-from carlasc.metrics.confusion import check_ids, to_numpy
+from carlasc.errors import FormatError
+from carlasc.metrics.confusion import check_free, check_ids, to_numpy
 from carlasc.metrics.scoring import Summed
 
-_BINS = 15
+_BINS = 15  # of equal width
 # maximum deviation of the sum of the probabilities of a voxel from 1; half precision has 5e-4
 _TOLERANCE = 1e-3
 _EPSILON = 1e-12  # added in the argument of the logarithm
@@ -78,23 +78,19 @@ class Uncertainty(Summed):
     Attributes:
         num_classes: K.
         free: id of free space.
-        bins: number of bins of equal width.
     """
 
-    _SETTINGS, _SUMS = ("num_classes", "free", "bins"), ("sums", "nll", "ece")
+    _SETTINGS, _SUMS = ("num_classes", "free"), ("sums", "nll", "ece")
 
-    def __init__(self, num_classes: int, *, free: int = 0, bins: int = _BINS) -> None:
-        if not 0 <= free < num_classes:
-            raise ArgumentError("free", expected=f"a class id below {num_classes}", found=str(free))
-        if bins < 1:
-            raise ArgumentError("bins", expected="at least 1", found=str(bins))
-        self.num_classes, self.free, self.bins = num_classes, free, bins
+    def __init__(self, num_classes: int, *, free: int = 0) -> None:
+        check_free(free, num_classes)
+        self.num_classes, self.free = num_classes, free
         self.reset()
 
     def reset(self) -> None:
         """Set all sums to zero."""
         # (free or occupied prediction; count, confidence, correct; bin)
-        self.sums = np.zeros((2, 3, self.bins))
+        self.sums = np.zeros((2, 3, _BINS))
         self.nll = np.zeros((2, 2))  # (free or occupied prediction; sum, count)
         # (free or occupied prediction; sum over frames, number of frames)
         self.ece = np.zeros((2, 2))
@@ -141,13 +137,9 @@ class Uncertainty(Summed):
         occupied = predicted != self.free
         for row, chosen in enumerate((~occupied, occupied)):
             # Bins are (low, high], so a confidence of exactly 1 is in the last bin.
-            bins = np.clip(
-                np.ceil(confidence[chosen] * self.bins).astype(int) - 1, 0, self.bins - 1
-            )
+            bins = np.clip(np.ceil(confidence[chosen] * _BINS).astype(int) - 1, 0, _BINS - 1)
             weights = None, confidence[chosen], right[chosen]
-            sums: FloatArray = np.stack(
-                [np.bincount(bins, weight, self.bins) for weight in weights]
-            )
+            sums: FloatArray = np.stack([np.bincount(bins, weight, _BINS) for weight in weights])
             self.sums[row] += sums
             if chosen.any():
                 self.ece[row] += _reliability(sums).ece, 1

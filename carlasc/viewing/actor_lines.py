@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from carlasc.core.arrays import AnyFloatArray, FloatArray
+from carlasc.core.arrays import AnyFloatArray, FloatArray, IntArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import transform_points
 from carlasc.core.scans import Scan
@@ -65,15 +65,18 @@ def motion_arrows(moving: Scan) -> tuple[FloatArray, FloatArray]:
     _, group = np.unique(keys, axis=0, return_inverse=True)
     group = group.reshape(-1)
     count = np.bincount(group)
-    middle, vectors = (
-        np.stack([np.bincount(group, values[:, a]) for a in range(3)], axis=1) / count[:, None]
-        for values in (moving.points, flow)
-    )
+    middle, vectors = _means(moving.points, group), _means(flow, group)
     top = np.full(len(count), -np.inf)
     np.maximum.at(top, group, moving.points[:, 2])
     middle[:, 2] = top + 0.4
     real = np.linalg.norm(vectors, axis=1) > MOVING_M_S
     return middle[real], vectors[real]
+
+
+def _means(values: AnyFloatArray, group: IntArray) -> FloatArray:
+    """Return the (G, 3) mean of the (N, 3) values of each group, by (N,) numbers of all groups."""
+    sums = np.stack([np.bincount(group, values[:, a]) for a in range(3)], axis=1)
+    return sums / np.bincount(group)[:, None]
 
 
 LONGEST = 50
@@ -155,10 +158,6 @@ def _actors(content: FrameContent, moving: Scan | None) -> Iterator[tuple[int, i
     if scan.flow is not None:
         chosen &= np.linalg.norm(scan.flow, axis=1) > MOVING_M_S
     actors, first, group = np.unique(scan.instances[chosen], return_index=True, return_inverse=True)
-    points = scan.points[chosen].astype(np.float64)
-    count = np.bincount(group.reshape(-1), minlength=len(actors))
-    middles = np.stack(
-        [np.bincount(group.reshape(-1), points[:, a], len(actors)) for a in range(3)], axis=1
-    )
-    labels = np.zeros(len(points), np.int64) if scan.labels is None else scan.labels[chosen]
-    yield from zip(actors.tolist(), labels[first].tolist(), middles / count[:, None], strict=True)
+    middles = _means(scan.points[chosen], group.reshape(-1))
+    labels = np.zeros(len(group), np.int64) if scan.labels is None else scan.labels[chosen]
+    yield from zip(actors.tolist(), labels[first].tolist(), middles, strict=True)

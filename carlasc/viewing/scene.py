@@ -233,23 +233,17 @@ def find_sequence(source: SceneSource, wanted: str | Sequence | None = None) -> 
 
 
 def _open_part(source: str | os.PathLike[str] | Source) -> NamedPart | None:
-    """Open a grid's folder or the file of one frame; None if the source is neither."""
+    """Open a grid's folder or the file of one frame, in the folder of a grid or of one of a scan's
+    fields; None if the source is neither.
+    """
     if isinstance(source, Source):
         return None
-    path = Path(source)
-    if path.is_file() and path.suffix in (".label", ".bin"):
-        return _open_file(path.absolute())
-    if (path / layout.PARAMS).is_file():
-        path = path.absolute()
-        return NamedPart(FolderSequence(path.parent), grid=path.name)
-    return None
-
-
-def _open_file(path: Path) -> NamedPart:
-    """Open the sequence that a frame's file belongs to; its folder is that of a grid or of one of a
-    scan's fields.
-    """
+    path = Path(source).absolute()
     folder = path.parent
+    if (path / layout.PARAMS).is_file():
+        return NamedPart(FolderSequence(folder), grid=path.name)
+    if not path.is_file() or path.suffix not in (".label", ".bin"):
+        return None
     frame = layout.frame_of(path.name, path.suffix)
     is_scan = folder.name in layout.scan_folders()
     if frame is None or not (is_scan or (folder / layout.PARAMS).is_file()):
@@ -260,8 +254,9 @@ def _open_file(path: Path) -> NamedPart:
             found="another file",
             advice=f"the geometry of a grid is in its {layout.PARAMS}",
         )
-    grid = None if is_scan else folder.name
-    return NamedPart(FolderSequence(folder.parent), grid, frame, is_scan)
+    return NamedPart(
+        FolderSequence(folder.parent), None if is_scan else folder.name, frame, is_scan
+    )
 
 
 def table_of(classes: ClassTable | str | None) -> ClassTable | None:
@@ -388,14 +383,13 @@ class RemappedSequence:
         return replace(grid, labels=labels)
 
     def read_scan(self, frame: int) -> Scan:
-        """Read the scan of a frame, in the table that is shown, without points that are not finite.
+        """Read the scan of a frame, in the table that is shown, without points that are not finite
+        and without boxes.
 
         Raises:
             FormatError: the scan does not have the format, or a label is not in its class table.
         """
-        scan = without_invalid_points(self.sequence.scan(frame))
-        if scan.boxes is not None:
-            scan = replace(scan, boxes=self._remap_boxes(scan.boxes, frame))
+        scan = without_invalid_points(self.sequence.scan(frame, layout.point_fields()))
         if scan.labels is None:
             return scan
         where = f"{self.sequence.location}: labels, frame {frame}"
@@ -409,7 +403,10 @@ class RemappedSequence:
             FormatError: the boxes do not have the format, or a label is not in its class table.
         """
         boxes = self.sequence.boxes(frame)
-        return None if boxes is None else self._remap_boxes(boxes, frame)
+        if boxes is None:
+            return None
+        where = f"{self.sequence.location}: boxes, frame {frame}"
+        return replace(boxes, labels=self._remap(boxes.labels, self.scan_table, where))
 
     def read_pose(self, frame: int) -> Transform | None:
         """Read (4, 4) first_T_sensor of a frame; None if the sequence has no poses.
@@ -440,10 +437,6 @@ class RemappedSequence:
             FormatError: it does not have the format.
         """
         return self.sequence.read(f"{self.grid}/{part}", frame).reshape(self.spec.size)
-
-    def _remap_boxes(self, boxes: Boxes, frame: int) -> Boxes:
-        where = f"{self.sequence.location}: boxes, frame {frame}"
-        return replace(boxes, labels=self._remap(boxes.labels, self.scan_table, where))
 
     def _remap(self, labels: LabelArray, stored: ClassTable, where: str) -> LabelArray:
         target = self.shown or stored
@@ -593,8 +586,8 @@ class SceneReader:
             FormatError: the data do not have the format.
         """
         scan = self.read_scan(frame)
-        boxes = scan.boxes if scan is not None else self.data.read_boxes(frame)
-        if scan is None and self.mirrored and boxes is not None:
+        boxes = self.data.read_boxes(frame)
+        if self.mirrored and boxes is not None:
             boxes = mirror_boxes(boxes)
         return FrameContent(
             self._read_grids(frame), scan, self.read_time(frame), boxes, self.read_pose(frame)

@@ -161,14 +161,13 @@ def view(
         endings = ", ".join((PAGES[0], *RECORDINGS))
         expected = f"a name that ends in {endings}, or without an ending for a folder"
         raise ArgumentError("out", expected=expected, found=str(out))
-    if (beside is not None or beside_grid is not None) and (target is None or recorded):
-        raise ArgumentError(
-            "beside", expected="a page, .html or a folder", found=str(out or "a window")
-        )
-    if full_points and not recorded:
-        raise ArgumentError(
-            "full_points", expected="a recording, .rrd or .mcap", found=str(out or "a window")
-        )
+    compared, page = beside is not None or beside_grid is not None, target and not recorded
+    for name, given, fits, expected in (
+        ("beside", compared, page, "a page, .html or a folder"),
+        ("full_points", full_points, recorded, "a recording, .rrd or .mcap"),
+    ):
+        if given and not fits:
+            raise ArgumentError(name, expected=expected, found=str(out or "a window"))
     if target is None:
         show_window(scene.open(), report)
         return None

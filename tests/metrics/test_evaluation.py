@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.errors import raises
 
 from carlasc import ClassTable, GridSpec, Run
 from carlasc.core.tables import CARLASC11, REMAPS
@@ -193,7 +194,7 @@ def test_sides_that_cannot_be_compared_are_refused_in_one_line(folders, world, t
         evaluate(pred, truth, grid="nothing")
     with pytest.raises(MissingDataError, match="none in the range"):
         evaluate(pred, truth, frames=(7, 9))
-    with pytest.raises(ArgumentError, match="voxels: expected known or all, found 'some'"):
+    with raises(ArgumentError, where="voxels", expected="known, all", found="some"):
         evaluate(pred, truth, scoring=Scoring(voxels="some"))
     with pytest.raises(ArgumentError, match="frames: expected a range that holds a frame"):
         evaluate(pred, truth, frames=(2, 1))
@@ -294,9 +295,11 @@ def test_scores_are_broken_down_by_distance_height_and_visibility(folders, world
     assert sum(m.total for name, m in parts.items() if name.endswith("up")) == result.matrix.total
     assert parts["0-10 m"].total == result.matrix.total
     assert result.tables()[-1].rows[0][0] == "0-10 m"
-    with pytest.raises(
+    with raises(
         ArgumentError,
-        match="by: expected any of distance, height, visibility, motion, seen, found 'colour'",
+        where="by",
+        expected="distance, height, visibility, motion, seen",
+        found="colour",
     ):
         evaluate(*folders, scoring=Scoring(by=("colour",)))
 

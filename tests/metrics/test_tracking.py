@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from helpers.errors import raises
 
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.metrics import TrackingQuality
@@ -88,7 +89,7 @@ def test_it_follows_the_definition_and_parts_can_be_merged(ignored, fewest):
 def test_nothing_is_no_number_and_wrong_input_is_refused():
     metric = TrackingQuality(3, {1})
     assert math.isnan(metric.compute().lstq)
-    with pytest.raises(FormatError, match="classes and numbers with the shape of the ground truth"):
+    with raises(FormatError, expected="classes and instances with the shape"):
         metric.update(
             "", (np.zeros(3, int), np.zeros(3, int)), (np.zeros(3, int), np.zeros(2, int))
         )

@@ -77,7 +77,7 @@ def test_merged_in_any_order_it_is_the_same():
     whole.reset()
     assert whole.compute().occupied.count.sum() == 0
     with pytest.raises(ArgumentError, match=r"expected a \w+ with \w+ "):
-        whole.merge(Uncertainty(K, bins=3))
+        whole.merge(Uncertainty(K + 1))
 
 
 def test_only_the_voxels_of_the_mask_count_and_tensors_do_as_arrays():

@@ -21,16 +21,22 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray, AnyIntArray, LabelArray
 from carlasc.core.geometry import invert, transform_points
-from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.grids import Grid
 from carlasc.core.scans import Scan
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics.confusion import ConfusionMatrix
 from carlasc.metrics.grids import check_same_geometry, compare_grids
 from carlasc.storage.camera_files import cameras_of, has_image
 from carlasc.viewing.actor_lines import Trail, Trails, box_lines, motion_arrows
-from carlasc.viewing.colors import ClassColors
 from carlasc.viewing.photos import encode_photos
-from carlasc.viewing.scene import FrameContent, Scene, SceneReader, SceneSource, find_sequence
+from carlasc.viewing.scene import (
+    FrameContent,
+    GridPanel,
+    Scene,
+    SceneReader,
+    SceneSource,
+    find_sequence,
+)
 
 Arrays = dict[str, AnyArray]
 
@@ -177,24 +183,16 @@ EVIDENCE = ("occupied", "views", "flags", "instance")
 
 
 @dataclass(frozen=True)
-class PagePanel:
+class PagePanel(GridPanel):
     """A grid of the page.
 
     Attributes:
-        name: "prediction", "truth", "errors", or "grid" if there is only one.
-        title: text above it: the name, the size of the grid if there is only one, or the name of
-            the run if two are compared.
-        spec: geometry.
-        colors: colours of its labels.
+        title: text above it; the name of the run if two are compared.
         run: number of the run that it belongs to: 0, or 1 for the run beside it.
         evidence: names from `EVIDENCE` of the fields that the grid has.
         beside: number of the panel that is drawn on the other side of the divider, or None.
     """
 
-    name: str
-    title: str
-    spec: GridSpec
-    colors: ClassColors
     run: int = 0
     evidence: tuple[str, ...] = ()
     beside: int | None = None
@@ -333,7 +331,13 @@ class PageContent:
         return {
             "name": reader.name,
             "leftHanded": reader.left_handed,
-            "tables": {name: _describe_classes(colors) for name, colors in tables.items()},
+            "tables": {  # [name, "#rrggbb"] by class id
+                name: [
+                    [colors.table.names.get(i, f"class {i}"), "#" + bytes(rgb.tolist()).hex()]
+                    for i, rgb in enumerate(colors.by_id)
+                ]
+                for name, colors in tables.items()
+            },
             "pointTable": reader.table.name,
             "colorBy": "class" if self._has_classes() else "height",
             "panels": [_describe_panel(panel) for panel in self.panels],
@@ -448,11 +452,3 @@ def _describe_panel(panel: PagePanel) -> dict[str, Any]:
         "upper": list(spec.upper),
         "voxel": spec.voxel_size.tolist(),
     }
-
-
-def _describe_classes(colors: ClassColors) -> list[list[Any]]:
-    """Return [name, "#rrggbb"] by class id."""
-    return [
-        [colors.table.names.get(number, f"class {number}"), "#" + bytes(color.tolist()).hex()]
-        for number, color in enumerate(colors.by_id)
-    ]

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -18,8 +18,6 @@ from carlasc.core.arrays import (
     LabelArray,
     Uint32Array,
 )
-from carlasc.core.boxes import Boxes
-from carlasc.core.geometry import Transform
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.storage.layout import FRAME_PERIOD_S
@@ -32,7 +30,7 @@ from carlasc.viewing.rendering.meshes import (
     split_arcs,
     surrounded,
 )
-from carlasc.viewing.scene import SceneReader
+from carlasc.viewing.scene import FrameContent, SceneReader
 
 MAX_POINTS = 30_000
 """Default number of points per frame, so that a frame is smaller than half a megabyte."""
@@ -97,34 +95,27 @@ def _faces(
     return corners.astype(np.float32), normals.astype(np.float32), labels[tuple(first.T)]
 
 
-@dataclass(frozen=True)
-class RecordedFrame:
+@dataclass(frozen=True, kw_only=True)
+class RecordedFrame(FrameContent):
     """One frame, in right-handed axes: x forward, y to the left, z up; in the frame of the sensor,
     unless noted.
 
     Attributes:
         number: frame number.
         time_s: seconds since the first frame; 0.1 s per frame if the sequence has no times.
-        grids: one for each panel of the scene.
-        scan: the thinned points with their labels; None if the frame has no points.
+        scan: the thinned points; None if the frame has no points.
         tails: (M, 3) start points of the arrows that show how actors move, metres.
         vectors: (M, 3) vectors of the arrows, metres per second.
-        boxes: tracked boxes; None if the frame was not annotated.
-        pose: (4, 4) world_T_sensor; the world is the frame of the first scan; None if the sequence
-            has no poses.
-        trails: the tracks of the actors up to this frame, in the world.
+        trails: the tracks of the actors up to this frame, in the world, the frame of the first
+            scan.
         picture: the bird's-eye camera picture as its JPEG bytes, or None.
         photos: the images of the cameras.
     """
 
     number: int
     time_s: float
-    grids: tuple[Grid, ...]
-    scan: Scan | None
     tails: FloatArray
     vectors: FloatArray
-    boxes: Boxes | None
-    pose: Transform | None
     trails: tuple[Trail, ...]
     picture: bytes | None
     photos: tuple[Photo, ...] = ()
@@ -153,25 +144,24 @@ def record_frames(reader: SceneReader, max_points: int | None) -> Iterator[Recor
     """
     trails = Trails()
     for position, number in enumerate(reader.frames):
-        content = reader.read(number)
-        time_s = number * FRAME_PERIOD_S if content.time_s is None else content.time_s
-        scan, nothing = content.scan, np.empty((0, 3))
-        tails, vectors = nothing, nothing
+        content, fields = reader.read(number), dict[str, Any]()
+        scan = content.scan
         moving = reader.read_motion(number, scan)
-        if moving is not None:
-            tails, vectors = motion_arrows(moving)
+        if content.time_s is None:
+            fields["time_s"] = number * FRAME_PERIOD_S
+        if scan is not None and max_points is not None:
+            fields["scan"] = thin_scan(scan, max_points)
+        tails, vectors = motion_arrows(
+            Scan(np.empty((0, 3), np.float32)) if moving is None else moving
+        )
         yield RecordedFrame(
-            number,
-            time_s,
-            content.grids,
-            scan if scan is None or max_points is None else thin_scan(scan, max_points),
-            tails,
-            vectors,
-            content.boxes,
-            content.pose,
-            trails.follow(position, content, moving),
-            reader.read_picture(number),
-            reader.read_photos(number),
+            **vars(content) | fields,
+            number=number,
+            tails=tails,
+            vectors=vectors,
+            trails=trails.follow(position, content, moving),
+            picture=reader.read_picture(number),
+            photos=reader.read_photos(number),
         )
 
 

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from carlasc.core.arrays import AnyFloatArray, FloatArray
+from carlasc.core.arrays import AnyFloatArray, FloatArray, RecordArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import Transform, quaternions_of
@@ -37,9 +37,9 @@ from carlasc.viewing.scene import GridPanel, SceneReader
 
 WORLD, EGO = "world", "ego"
 
-_POINT = np.dtype([("xyz", "<f4", 3), ("rgba", "u1", 4), ("label", "<u2")])
-_CELL = np.dtype([("rgba", "u1", 4), ("label", "<u2")])
-_COLOR_FIELDS = ("red", "green", "blue", "alpha")
+_RGB = ("red", "green", "blue")
+_CELL = [*((name, "u1") for name in (*_RGB, "alpha")), ("label", "<u2")]
+_POINT = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), *_CELL]
 _BOX_ALPHA, _LINE_M, _ARROW_M = 0.35, 0.15, 0.24
 
 
@@ -155,16 +155,12 @@ class FoxgloveWriter:
         """Return a grid as the content of a VoxelGrid: colours, transparent where free, and class
         ids, in the order z, y, x.
         """
-        m = self._messages
         columns, rows, slices = grid.spec.size
         labels = grid.labels.transpose(2, 1, 0)
         cells = np.zeros((slices, rows, columns), _CELL)
-        cells["rgba"][..., :3], cells["rgba"][..., 3] = (
-            panel.colors.by_id[labels],
-            np.where(labels, 255, 0),
-        )
-        cells["label"] = labels
-        cells["rgba"][labels == 0] = 0
+        cells["alpha"], cells["label"] = np.where(labels, 255, 0), labels
+        for name, values in zip(_RGB, panel.colors.by_id.T, strict=True):
+            cells[name] = np.where(labels, values[labels], 0)
         corner = np.eye(4)
         corner[:3, 3] = grid.spec.lower
         return {
@@ -172,41 +168,27 @@ class FoxgloveWriter:
             "row_count": rows,
             "column_count": columns,
             "cell_size": self._vector(grid.spec.voxel_size),
-            "cell_stride": _CELL.itemsize,
-            "row_stride": _CELL.itemsize * columns,
-            "slice_stride": _CELL.itemsize * columns * rows,
-            "fields": [
-                *self._color_fields(0),
-                m.PackedElementField(name="label", offset=4, type=self._uint(2)),
-            ],
+            "cell_stride": cells.itemsize,
+            "row_stride": cells.itemsize * columns,
+            "slice_stride": cells.itemsize * columns * rows,
+            "fields": self._fields_of(cells),
             "data": cells.tobytes(),
         }
 
     def _points(self, scan: Scan) -> dict[str, Any]:
         """Return a scan as the content of a PointCloud."""
-        m = self._messages
         numbered = scan.instances is not None
-        points = np.zeros(len(scan), [*_POINT.descr, ("instance", "<u4")] if numbered else _POINT)
+        points = np.zeros(len(scan), [*_POINT, ("instance", "<u4")] if numbered else _POINT)
         if numbered:
             points["instance"] = scan.instances
-        points["xyz"], points["rgba"] = scan.points, 255
-        points["rgba"][:, :3] = self._reader.colors.of_points(scan)
-        points["label"] = 0 if scan.labels is None else scan.labels
-        float32 = m.PackedElementFieldNumericType.Float32
-        axes = [
-            m.PackedElementField(name=name, offset=4 * i, type=float32)
-            for i, name in enumerate("xyz")
-        ]
-        label = m.PackedElementField(name="label", offset=16, type=self._uint(2))
-        numbers = (
-            [m.PackedElementField(name="instance", offset=18, type=self._uint(4))]
-            if numbered
-            else []
-        )
+        points["alpha"], points["label"] = 255, 0 if scan.labels is None else scan.labels
+        columns = *scan.points.T, *self._reader.colors.of_points(scan).T
+        for name, values in zip((*"xyz", *_RGB), columns, strict=True):
+            points[name] = values
         return {
             "pose": self._pose(np.eye(4)),
             "point_stride": points.itemsize,
-            "fields": [*axes, *self._color_fields(12), label, *numbers],
+            "fields": self._fields_of(points),
             "data": points.tobytes(),
         }
 
@@ -292,15 +274,15 @@ class FoxgloveWriter:
         red, green, blue = (value / 255 for value in color)
         return self._messages.Color(r=red, g=green, b=blue, a=alpha)
 
-    def _color_fields(self, offset: int) -> list[Any]:
-        field, byte = self._messages.PackedElementField, self._uint(1)
-        return [
-            field(name=name, offset=offset + i, type=byte) for i, name in enumerate(_COLOR_FIELDS)
-        ]
-
-    def _uint(self, size: int) -> Any:
+    def _fields_of(self, elements: RecordArray) -> list[Any]:
+        """Return the names, places and types of the fields of packed elements."""
         types = self._messages.PackedElementFieldNumericType
-        return {1: types.Uint8, 2: types.Uint16, 4: types.Uint32}[size]
+        return [
+            self._messages.PackedElementField(
+                name=name, offset=offset, type=getattr(types, kind.name.capitalize())
+            )
+            for name, (kind, offset, *_) in (elements.dtype.fields or {}).items()
+        ]
 
 
 def _calibration(camera: CameraModel) -> dict[str, Any]:

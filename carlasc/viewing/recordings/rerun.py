@@ -31,7 +31,6 @@ from carlasc.core.grids import Grid
 from carlasc.errors import import_extra
 from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc.viewing import colors as palette
-from carlasc.viewing.colors import ClassColors
 from carlasc.viewing.photos import Photo
 from carlasc.viewing.recordings.content import RecordedFrame, Triangles, class_cells, class_surfaces
 from carlasc.viewing.rendering.drawings import ego_vehicle
@@ -150,7 +149,10 @@ class RerunWriter:
         def log(entity: str, *content: Any) -> None:
             self._recording.log(entity, *content, static=True)
 
-        log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, self._classes(reader.colors))
+        entries = reader.colors.entries(reader.table.names)
+        classes = [(0, "unlabelled", palette.UNLABELLED)]
+        classes += [(entry.order, entry.name, entry.color) for entry in entries]
+        log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, rr.AnnotationContext(classes))
         car = ego_vehicle()
         corners, triangles = car.triangles()
         surface = Triangles(corners, np.repeat(car.normals, 4, axis=0), triangles.astype(np.uint32))
@@ -229,13 +231,6 @@ class RerunWriter:
             vertex_normals=surface.normals,
             triangle_indices=surface.indices,
             **colors,
-        )
-
-    def _classes(self, colors: ClassColors) -> Any:
-        entries = colors.entries(colors.table.names)
-        unlabelled = (0, "unlabelled", palette.UNLABELLED)
-        return self._rr.AnnotationContext(
-            [unlabelled, *((entry.order, entry.name, entry.color) for entry in entries)]
         )
 
     def _blueprint(self) -> Any:

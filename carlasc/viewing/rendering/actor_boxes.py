@@ -54,8 +54,7 @@ def boxes_in(data: RemappedSequence, frame: int) -> Boxes:
     Raises:
         FormatError: the boxes or the scan do not have the format.
     """
-    annotated = data.read_boxes(frame)
-    if annotated is not None:
+    if (annotated := data.read_boxes(frame)) is not None:
         return annotated
     numbered = not data.has("boxes") and frame in data.frames_with("points", "instances")
     return tight_boxes(data.read_scan(frame) if numbered else Scan(np.empty((0, 3), np.float32)))
@@ -102,14 +101,7 @@ def with_boxes(drawing: Drawing, boxes: Boxes) -> Drawing:
     """Return a drawing with the edges of boxes, and a bar on the floor of each from its middle to
     its front.
     """
-    if not len(boxes.tracks):
-        return drawing
-    mesh = box_edges(boxes)
-    return replace(
-        drawing,
-        mesh=mesh if drawing.mesh is None else join([drawing.mesh, mesh]),
-        legend=[*drawing.legend, BOX],
-    )
+    return drawing.with_mesh(box_edges(boxes), BOX) if len(boxes.tracks) else drawing
 
 
 def box_edges(boxes: Boxes) -> QuadMesh:

@@ -18,7 +18,7 @@ from carlasc.core.arrays import Float32Array, FloatArray
 from carlasc.core.choices import ViewName
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, rotate_vectors, transform_points
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, check_choice
 from carlasc.storage.metadata import Axes
 
 Floats = FloatArray
@@ -161,10 +161,7 @@ class CameraOptions:
     still: bool = False
 
     def __post_init__(self) -> None:
-        if self.view not in (*VIEWS, "both"):
-            raise ArgumentError(
-                "view", expected=f"{', '.join(VIEWS)} or both", found=repr(self.view)
-            )
+        check_choice("view", self.view, ViewName)
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -291,9 +288,7 @@ def perspective_camera(
     return Camera(target - distance * rows[2], rows, tan_y)
 
 
-def birdseye_camera(
-    extent: Floats, aspect: float, *, axes: Axes = "left", margin: float = 0.01
-) -> Camera:
+def birdseye_camera(extent: Floats, aspect: float, *, axes: Axes = "left") -> Camera:
     """Return an orthographic camera above the extent: x points up in the picture, the vehicle's
     right is on the right.
     """
@@ -302,7 +297,7 @@ def birdseye_camera(
     rows = np.array(
         [[0.0, 1.0 if axes == "left" else -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
     )
-    half_height = max(size[0], size[1] / aspect) / 2 / (1 - 2 * margin)
+    half_height = max(size[0], size[1] / aspect) / 2 / 0.98  # leaves a margin
     middle = (lower + upper) / 2
     return Camera(
         np.array([middle[0], middle[1], upper[2] + 10.0]),

@@ -4,9 +4,9 @@ scan, scene flow or the errors of a prediction.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import get_args
 
 import numpy as np
 
@@ -19,14 +19,7 @@ from carlasc.metrics.grids import VoxelOutcome, compare_grids
 from carlasc.storage.metadata import Axes
 from carlasc.viewing import colors as palette
 from carlasc.viewing.actor_lines import MOVING_M_S, motion_arrows
-from carlasc.viewing.colors import (
-    AFTER_CLASSES,
-    ERRORS,
-    ClassColors,
-    Entry,
-    as_color,
-    height_colors,
-)
+from carlasc.viewing.colors import AFTER_CLASSES, ERRORS, ClassColors, Entry, as_color
 from carlasc.viewing.rendering.cameras import Camera
 from carlasc.viewing.rendering.meshes import (
     QuadMesh,
@@ -44,25 +37,7 @@ Extent = FloatArray
 """(N, 3) float64 points, metres, that a camera fitted to the drawing shows."""
 
 _FLOOR = (240, 240, 243)
-GRID_COLORS: tuple[str, ...] = get_args(GridColor)
-_PARTS = {"confidence": "occupied", "views": "views", "votes": "counts", "inferred": "flags"}
-_PARTS |= {"actor": "instance", "seen": "seen"}
-_KEPT_BY = {"actor": "actors", "seen": "seen"}  # options of regrid
-# upper bounds of the classes of probabilities, except for the last one
-_SHARES = (0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
-_POWERS = 7  # classes of numbers: 1, 2 to 3, 4 to 7, ..., 64 and more
 VELOCITY = Entry("velocity (distance in 1 s)", palette.ARROW, AFTER_CLASSES)
-_ORIGINS = (
-    Entry("seen in this frame", (0, 114, 178), 0),
-    Entry("seen in other frames", (190, 196, 204), 1),
-    Entry("contested: traffic passes at other times", (204, 121, 167), 2),
-    Entry("inferred: no scan saw it", (230, 110, 0), 3),
-)
-_SEEN = (
-    Entry("no camera sees it", (190, 196, 204)),
-    Entry("one camera", (0, 114, 178), 1),
-    Entry("several cameras", (230, 110, 0), 2),
-)
 
 
 @dataclass(frozen=True)
@@ -84,6 +59,11 @@ class Drawing:
     point_colors: Uint8Array | None = None
     legend: list[Entry] = field(default_factory=list)
     note: str | None = None
+
+    def with_mesh(self, mesh: QuadMesh, entry: Entry) -> Drawing:
+        """Return the drawing with further faces and their entry in the legend."""
+        meshes = [mesh] if self.mesh is None else [self.mesh, mesh]
+        return replace(self, mesh=join(meshes), legend=[*self.legend, entry])
 
     def render(self, camera: Camera, width: int, height: int, *, axes: Axes = "left") -> Uint8Array:
         """Return the picture, (H, W, 3) uint8, without legend or title.
@@ -256,9 +236,7 @@ def with_arrows(drawing: Drawing, moving: Scan | None) -> Drawing:
     """Return a drawing with the arrows of moving points or voxels; None if nothing moves."""
     if moving is None or not len((ends := motion_arrows(moving))[0]):
         return drawing
-    mesh = arrows(*ends, palette.ARROW, 0.24)
-    mesh = mesh if drawing.mesh is None else join([drawing.mesh, mesh])
-    return replace(drawing, mesh=mesh, legend=[*drawing.legend, VELOCITY])
+    return drawing.with_mesh(arrows(*ends, palette.ARROW, 0.24), VELOCITY)
 
 
 def voxel_drawing(
@@ -309,32 +287,112 @@ def check_color(color: GridColor, reader: SceneReader) -> None:
         ArgumentError: an unknown colour, or no grid is shown.
         MissingDataError: a frame lacks the field.
     """
-    check_choice("color", color, GRID_COLORS)
+    check_choice("color", color, GridColor)
     if color == "class":
         return
     if "grid" not in reader.contents:
         raise ArgumentError("color", expected="class where no grid is shown", found=repr(color))
     data, frames = reader.data, reader.frames
-    field = f"{data.grid}/{_PARTS[color]}"
+    evidence = EVIDENCE[color]
+    field = f"{data.grid}/{evidence.part}"
     missing = sorted(set(frames) - data.frames_with(field))
     if missing:
+        keep = f"make the grid again with `carlasc regrid --keep-{evidence.kept_by}`"
         raise MissingDataError(
             data.sequence.location,
             expected=f"the field {field} in all frames that are shown",
             found=f"none in {len(missing)} of {len(frames)} frames, such as frame {missing[0]}",
-            advice=""
-            if color == "votes"
-            else f"make the grid again with `carlasc regrid "
-            f"--keep-{_KEPT_BY.get(color, 'evidence')}`",
+            advice=keep if evidence.kept_by else "",
         )
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the colours of a grid show, other than classes.
+
+    Attributes:
+        part: the field of the grid.
+        kept_by: the option of regrid that keeps the field; "" if all grids have it.
+        legend: all classes of values, so that it is the same in all frames.
+        classify: returns the number of the class of each value: its place in `colors`.
+    """
+
+    part: str
+    kept_by: str
+    legend: list[Entry]
+    classify: Callable[[AnyArray], AnyArray]
+
+    @property
+    def colors(self) -> Uint8Array:
+        """(K, 3) uint8 RGB of the classes of values."""
+        if self.part == "instance":
+            return palette.ACTORS.palette
+        return np.array([entry.color for entry in self.legend], np.uint8)
+
+
+def _scale(unit: str, names: Sequence[str]) -> list[Entry]:
+    """Return a legend of rising values, from dark to light."""
+    colors = palette.height_colors(np.linspace(0.0, 1.0, len(names)), 0, 1)
+    return [
+        Entry(name if number else unit + name, as_color(rgb), number)
+        for number, (name, rgb) in enumerate(zip(names, colors, strict=True))
+    ]
+
+
+def _origin_of(flags: AnyArray) -> IntArray:
+    seen = np.where(flags & VoxelFlag.SEEN_NOW, 0, 1)
+    scanned = np.where(flags & VoxelFlag.CONTESTED, 2, seen)
+    return np.where(flags & VoxelFlag.INFERRED, 3, scanned)
+
+
+def _power_of(numbers: AnyArray) -> AnyArray:
+    powers = np.floor(np.log2(np.maximum(numbers.astype(np.float64), 1)))
+    return np.minimum(powers, len(_NUMBERS) - 1).astype(np.int64)
+
+
+# upper bounds of the classes of probabilities, except for the last one
+_BOUNDS = (0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
+_SHARES = [f"{low * 100:.0f} to {high:.0%}" for low, high in pairwise(_BOUNDS)]
+_SHARES = [f"up to {_BOUNDS[0]:.0%}", *_SHARES, f"over {_BOUNDS[-1]:.0%}"]
+_NUMBERS = ["1", "2 to 3", "4 to 7", "8 to 15", "16 to 31", "32 to 63", "64 and more"]
+_GREY, _BLUE, _ORANGE = (190, 196, 204), (0, 114, 178), (230, 110, 0)
+_ORIGINS = [
+    Entry("seen in this frame", _BLUE, 0),
+    Entry("seen in other frames", _GREY, 1),
+    Entry("contested: traffic passes at other times", (204, 121, 167), 2),
+    Entry("inferred: no scan saw it", _ORANGE, 3),
+]
+_ACTORS = [
+    Entry("no actor", palette.STATIC),
+    Entry("an actor, each in a colour of its own", palette.ACTORS.colors[2], 1),
+]
+_CAMERAS = [
+    Entry("no camera sees it", _GREY),
+    Entry("one camera", _BLUE, 1),
+    Entry("several cameras", _ORANGE, 2),
+]
+EVIDENCE = {
+    "confidence": Evidence(
+        "occupied",
+        "evidence",
+        _scale("occupied: ", _SHARES),
+        lambda values: np.digitize(values.astype(np.float64), _BOUNDS),
+    ),
+    "views": Evidence("views", "evidence", _scale("scans: ", _NUMBERS), _power_of),
+    "votes": Evidence("counts", "", _scale("votes: ", _NUMBERS), _power_of),
+    "inferred": Evidence("flags", "evidence", _ORIGINS, _origin_of),
+    "actor": Evidence("instance", "actors", _ACTORS, palette.actor_ids),
+    "seen": Evidence(
+        "seen", "seen", _CAMERAS, lambda values: np.minimum(np.bitwise_count(values), 2)
+    ),
+}
+"""By `GridColor`, except for "class"."""
 
 
 def evidence_drawing(
     data: RemappedSequence, frame: int, color: GridColor, *, ego: bool = True
 ) -> Drawing:
     """Return the occupied voxels of a grid, coloured by evidence.
-
-    The legend has all classes of values, so that it is the same in all frames.
 
     Args:
         data: the sequence and its grid.
@@ -346,59 +404,7 @@ def evidence_drawing(
         MissingDataError: the frame lacks the field.
         FormatError: the grid does not have the format.
     """
-    grid = data.read_grid(frame)
-    values = data.read_part(_PARTS[color], frame)
-    numbers, legend = _classify(values, color), evidence_legend(color)
-    colors = (
-        palette.ACTORS.palette
-        if color == "actor"
-        else np.array([entry.color for entry in legend], np.uint8)
-    )
-    return voxel_drawing(
-        grid.spec, colors[numbers], grid.labels > 0, legend, "no voxel is occupied", ego
-    )
-
-
-def evidence_legend(color: GridColor) -> list[Entry]:
-    """Return the legend of `evidence_drawing`."""
-    if color == "inferred":
-        return list(_ORIGINS)
-    if color == "seen":
-        return list(_SEEN)
-    if color == "actor":
-        first = palette.ACTORS.colors[2]
-        return [
-            Entry("no actor", palette.STATIC),
-            Entry("an actor, each in a colour of its own", first, 1),
-        ]
-    if color == "confidence":
-        names = [f"up to {_SHARES[0]:.0%}"]
-        names += [f"{low * 100:.0f} to {high:.0%}" for low, high in pairwise(_SHARES)]
-        names.append(f"over {_SHARES[-1]:.0%}")
-        unit = "occupied: "
-    else:
-        names = ["1"] + [f"{2**power} to {2 ** (power + 1) - 1}" for power in range(1, _POWERS - 1)]
-        names.append(f"{2 ** (_POWERS - 1)} and more")
-        unit = "scans: " if color == "views" else "votes: "
-    colors = height_colors(np.linspace(0.0, 1.0, len(names)), 0, 1)
-    names[0] = unit + names[0]
-    return [
-        Entry(name, as_color(rgb), number)
-        for number, (name, rgb) in enumerate(zip(names, colors, strict=True))
-    ]
-
-
-def _classify(values: AnyArray, color: GridColor) -> IntArray:
-    """Return the entry of the legend for each voxel; for actors the id in `palette.ACTORS`."""
-    if color == "inferred":
-        seen = np.where(values & VoxelFlag.SEEN_NOW, 0, 1)
-        scanned = np.where(values & VoxelFlag.CONTESTED, 2, seen)
-        return np.where(values & VoxelFlag.INFERRED, 3, scanned)
-    if color == "seen":
-        return np.minimum(np.bitwise_count(values), 2).astype(np.int64)
-    if color == "actor":
-        return palette.actor_ids(values).astype(np.int64)
-    if color == "confidence":
-        return np.digitize(values.astype(np.float64), _SHARES)
-    powers = np.floor(np.log2(np.maximum(values.astype(np.float64), 1)))
-    return np.minimum(powers, _POWERS - 1).astype(np.int64)
+    grid, evidence = data.read_grid(frame), EVIDENCE[color]
+    colors = evidence.colors[evidence.classify(data.read_part(evidence.part, frame))]
+    empty = "no voxel is occupied"
+    return voxel_drawing(grid.spec, colors, grid.labels > 0, evidence.legend, empty, ego)

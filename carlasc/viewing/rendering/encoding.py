@@ -6,9 +6,12 @@ from __future__ import annotations
 
 import subprocess
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from functools import partial
+from itertools import chain
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 
@@ -18,6 +21,7 @@ from carlasc.storage.files import write_output
 
 STILLS = (".png",)
 FILMS = (".gif", ".mp4", ".webp")
+NAME_A_FILM = "name a .gif, .mp4 or .webp"
 _H264 = "-c:v libx264 -crf 18 -preset medium -pix_fmt yuv420p -movflags +faststart"
 _ENCODERS = {
     ".mp4": f"{_H264} -f mp4".split(),
@@ -28,6 +32,17 @@ _ENCODERS = {
 def is_film(path: Path) -> bool:
     """Whether a file name has the ending of a format that holds several pictures."""
     return path.suffix.lower() in FILMS
+
+
+def check_single(path: Path, frames: Sequence[int]) -> None:
+    """Raise ArgumentError if several frames are given for a file that holds one picture."""
+    if not is_film(path) and len(frames) > 1:
+        raise ArgumentError(
+            "out",
+            expected="a single frame for a PNG",
+            found=f"{len(frames)} frames for {path.name}",
+            advice=NAME_A_FILM,
+        )
 
 
 def encodable_size(path: Path, size: tuple[int, int]) -> tuple[int, int]:
@@ -60,17 +75,9 @@ def write_pictures(
         )
     suffix = path.suffix.lower()
     if suffix in STILLS:
-        image, settings = (
-            import_extra("PIL.Image", "render"),
-            {} if dpi is None else {"dpi": (dpi, dpi)},
-        )
-        first = iter(pictures)
-        write_output(
-            path,
-            lambda f: image.fromarray(next(first)).save(
-                f, format="PNG", compress_level=4, **settings
-            ),
-        )
+        settings = {} if dpi is None else {"dpi": (dpi, dpi)}
+        image = import_extra("PIL.Image", "render").fromarray(next(iter(pictures)))
+        write_output(path, partial(image.save, format="PNG", compress_level=4, **settings))
     elif suffix == ".gif":
         write_output(path, lambda file: _write_gif(file, iter(pictures), fps))
     else:
@@ -124,7 +131,10 @@ def _encode(
             start_new_session=True,  # Ctrl-C must not reach the encoder: this process ends it
         )
         try:
-            _feed(process, picture, pictures)
+            # if the encoder ends early, its exit code says so
+            with suppress(BrokenPipeError), cast(BinaryIO, process.stdin) as pipe:
+                for one in chain([picture], pictures):
+                    pipe.write(np.ascontiguousarray(one).data)
         except BaseException:
             process.kill()
             process.wait()
@@ -137,19 +147,3 @@ def _encode(
             raise CarlascError(
                 encoder, problem=f"failed with exit code {process.returncode}", advice=lines[-1]
             )
-
-
-def _feed(process: subprocess.Popen[bytes], first: Uint8Array, rest: Iterator[Uint8Array]) -> None:
-    """Write pictures to the encoder's input.
-
-    If the encoder ends early, its exit code is checked by the caller.
-    """
-    if process.stdin is None:
-        raise CarlascError("the video encoder", expected="a pipe to its input", found="none")
-    with process.stdin as pipe:
-        try:
-            pipe.write(np.ascontiguousarray(first).data)
-            for picture in rest:
-                pipe.write(np.ascontiguousarray(picture).data)
-        except BrokenPipeError:
-            return

@@ -26,6 +26,8 @@ SQUARE = ((0, 0), (1, 0), (1, 1), (0, 1))
 """Corners of a face, in order around it."""
 SIDES = [(axis, side) for axis in range(3) for side in (0, 1)]
 """The sides of a cell: an axis, and 0 for its lower or 1 for its upper side."""
+# by the number of cells next to a corner that hide the sky; two beside the face hide the third
+_OPENNESS = np.array([1.0, 0.82, 0.68, 0.56], np.float32)
 
 
 @dataclass(frozen=True)
@@ -165,6 +167,13 @@ def exposed_cells(
     return exposed
 
 
+def _unit_face(axis: int, side: int) -> IntArray:
+    """Return the (4, 3) corners of a side of a unit cell, in order around it."""
+    corners = np.full((4, 3), side)
+    corners[:, [(axis + 1) % 3, (axis + 2) % 3]] = SQUARE
+    return corners
+
+
 def face_corners(
     spec: GridSpec, first: IntArray, last: IntArray, axis: int, side: int
 ) -> tuple[AnyFloatArray, AnyFloatArray]:
@@ -177,15 +186,10 @@ def face_corners(
         axis: number of the axis that the faces are perpendicular to.
         side: 0 for the lower, 1 for the upper side of the cells.
     """
-    edges = [spec.edges(a) for a in range(3)]
-    corners: AnyFloatArray = np.empty((len(first), 4, 3))
-    for number, in_plane in enumerate(SQUARE):
-        offset = np.zeros(3, np.int64)
-        offset[[axis, (axis + 1) % 3, (axis + 2) % 3]] = side, *in_plane
-        lattice = np.where(offset == 1, last + 1, first)
-        lattice[:, axis] = first[:, axis] + side
-        corners[:, number] = np.stack([edges[a][lattice[:, a]] for a in range(3)], axis=1)
-    corners = spec.from_axes(corners)
+    lattice = np.where(_unit_face(axis, side) == 1, last[:, None] + 1, first[:, None])
+    corners = spec.from_axes(
+        np.stack([spec.edges(a)[lattice[..., a]] for a in range(3)], axis=-1).astype(np.float64)
+    )
     normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
     normals *= 2 * side - 1
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
@@ -206,55 +210,26 @@ def _faces(
     front = cells + 1
     front[:, axis] += 2 * side - 1
     openness = np.empty((len(cells), 4), np.float32)
-    for number, (first, second) in enumerate(SQUARE):
-        openness[:, number] = _corner_openness(
-            solid, front, across, along, 2 * first - 1, 2 * second - 1
-        )
+    for number, towards in enumerate(2 * _unit_face(axis, side) - 1):
+        # the three cells next to a corner, in the layer in front of the face
+        steps = np.diag(towards)
+        nearby = front + steps[across], front + steps[along], front + steps[across] + steps[along]
+        a, b, c = (solid[tuple(places.T)] for places in nearby)
+        openness[:, number] = _OPENNESS[np.where(a & b, 3, a.astype(np.int64) + b + c)]
+    # all edges are drawn except those between the flat pieces of one wide wedge
+    drawn, piece = np.ones((len(cells), 4), np.bool_), cells[:, 1] % pieces
+    if pieces > 1 and axis != 1:  # edge 0: along low, 1: across high, 2: along high, 3: across low
+        low, high = (3, 1) if across == 1 else (0, 2)
+        drawn[:, low], drawn[:, high] = piece == 0, piece == pieces - 1
     corners, normals = face_corners(spec, cells, cells, axis, side)
     return QuadMesh(
         corners.astype(np.float32),
         normals.astype(np.float32),
         colors[tuple(cells.T)],
         openness,
-        _drawn_edges(cells, across, along, pieces),
+        drawn,
         np.zeros(len(cells), np.bool_),
     )
-
-
-def _corner_openness(
-    solid: BoolArray,
-    front: IntArray,
-    across: int,
-    along: int,
-    first: int,
-    second: int,
-) -> Float32Array:
-    """Return the openness of a corner of each face, from the three cells next to it in the layer in
-    front of the face.
-    """
-    one, two = front.copy(), front.copy()
-    one[:, across] += first
-    two[:, along] += second
-    both = one.copy()
-    both[:, along] += second
-    a, b, c = (solid[tuple(cells.T)] for cells in (one, two, both))
-    closed = np.where(a & b, 3, a.astype(np.int64) + b + c)
-    return np.array([1.0, 0.82, 0.68, 0.56], np.float32)[closed]
-
-
-def _drawn_edges(cells: IntArray, across: int, along: int, pieces: int) -> BoolArray:
-    """Return which edges of a face are drawn: all except those between the flat pieces of one wide
-    wedge.
-    """
-    # edge 0: along low, 1: across high, 2: along high, 3: across low
-    drawn = np.ones((len(cells), 4), np.bool_)
-    if pieces > 1:
-        piece = cells[:, 1] % pieces
-        if across == 1:
-            drawn[:, 3], drawn[:, 1] = piece == 0, piece == pieces - 1
-        elif along == 1:
-            drawn[:, 0], drawn[:, 2] = piece == 0, piece == pieces - 1
-    return drawn
 
 
 def footprint(spec: GridSpec, height: float) -> Float32Array:
@@ -278,12 +253,8 @@ def box(lower: ArrayLike, upper: ArrayLike, color: ArrayLike, *, taper: float = 
     inwards = np.array([[taper, taper, 0.0], [-taper, -taper, 0.0]], np.float32)
     faces = []
     for axis, side in SIDES:
-        face = np.empty((4, 3), np.float32)
-        for number, in_plane in enumerate(SQUARE):
-            pick = np.zeros(3, np.int64)
-            pick[[axis, (axis + 1) % 3, (axis + 2) % 3]] = side, *in_plane
-            face[number] = low_high[pick, np.arange(3)] + pick[2] * inwards[pick, np.arange(3)]
-        faces.append(face if side else face[::-1])
+        pick = _unit_face(axis, side)[:: 2 * side - 1]  # counter-clockwise seen from outside
+        faces.append(low_high[pick, np.arange(3)] + pick[:, 2:] * inwards[pick, np.arange(3)])
     return quads(np.array(faces), color, edges=True, open_sky=True)
 
 

@@ -20,6 +20,7 @@ from carlasc.storage.files import check_target
 from carlasc.viewing.rendering.encoding import (
     FILMS,
     STILLS,
+    check_single,
     encodable_size,
     is_film,
     write_pictures,
@@ -63,14 +64,7 @@ def overlay(
     reader = scene.open("grid")
     model = camera_named(reader.data.sequence, camera)
     frames = reader.frames if is_film(out) or scene.frames is not None else reader.frames[:1]
-    if len(frames) > 1 and not is_film(out):
-        found = f"{len(frames)} frames for {out.name}"
-        raise ArgumentError(
-            "out",
-            expected="a single frame for a PNG",
-            found=found,
-            advice="name a .gif, .mp4 or .webp",
-        )
+    check_single(out, frames)
     width, height = encodable_size(out, (model.width, model.height))
     write_pictures(
         out,

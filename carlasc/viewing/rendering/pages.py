@@ -8,13 +8,14 @@ Captions, which replace titles, are below the panels. The font is the one that P
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from carlasc.core.arrays import Uint8Array
+from carlasc.core.classes import Color
 from carlasc.errors import import_extra
 from carlasc.viewing.colors import Entry
 from carlasc.viewing.rendering.styles import check_size
@@ -89,14 +90,15 @@ def plan_page(
     width, height = size
     if font_size is None:
         font_size = int(np.clip(round(min(width / 72, height / 40)), 9, 40))
-    entries, positions, area = _place_legend(size, font_size, list(legend), panels, aspect, columns)
+    font = font_of(font_size)
+    entries, entry_boxes, area = _place_legend(size, font, list(legend), panels, aspect, columns)
     columns, rows = _tiling(area.width, area.height, panels, aspect, columns)
     gap = max(2, font_size // 2) if panels > 1 else 0
     title_height = round(font_size * 1.9) if titled else 0
     if captions:
-        room, font = area.width / columns - 2 * gap, font_of(font_size)
+        room = area.width / columns - 2 * gap
         lines = max(len(wrap_text(text, font, room)) for text in captions)
-        title_height = round(font_size * 0.4) + lines * line_height(font_size)
+        title_height = round(font_size * 0.4) + lines * line_height(font)
     boxes, titles = [], []
     for number in range(panels):
         column, row = number % columns, number // columns
@@ -106,19 +108,12 @@ def plan_page(
             left, right = left + gap, left + max(gap + 1, area.width // columns - gap)
             bottom = top + area.height // rows
         else:
-            left, right = (
-                left + (gap if column else 0),
-                right - (gap if column + 1 < columns else 0),
-            )
+            left += gap if column else 0
+            right -= gap if column + 1 < columns else 0
         width, height = max(1, right - left), max(1, bottom - top - title_height)
         title, panel = (height, 0) if captions else (0, title_height)
         titles.append(Box(area.x + left, area.y + top + title, right - left, title_height))
         boxes.append(Box(area.x + left, area.y + top + panel, width, height))
-    font = font_of(font_size) if entries else None
-    entry_boxes = [
-        Box(x, y, entry_width(entry, font, font_size), line_height(font_size))
-        for entry, (x, y) in zip(entries, positions, strict=True)
-    ]
     return Page(size, font_size, boxes, titles if titled or captions else [], entry_boxes, entries)
 
 
@@ -139,118 +134,127 @@ def draw_page(
         notes: for each panel, a line to write into its middle, or None.
         wrapped: whether titles are captions, which are broken into lines.
     """
-    image_module = import_extra("PIL.Image", "render")
     canvas = np.full((page.size[1], page.size[0], 3), 255, np.uint8)
     for box, picture in zip(page.panels, pictures, strict=True):
         canvas[box.y : box.y + box.height, box.x : box.x + box.width] = picture
-    image = image_module.fromarray(canvas)
+    image = import_extra("PIL.Image", "render").fromarray(canvas)
     draw, font = import_extra("PIL.ImageDraw", "render").Draw(image), font_of(page.font_size)
+
+    def write(box: Box, middle: float, text: str, color: Color) -> None:
+        draw.text((box.x + box.width / 2, middle), text, color, font, anchor="mm")
+
     for box, title in zip(page.titles, titles, strict=False):
-        line, top = line_height(page.font_size), box.y + round(page.font_size * 0.4)
-        lines = (
-            wrap_text(title, font, box.width) if wrapped else [shorten(title, font, box.width - 8)]
-        )
-        for number, text in enumerate(lines):
-            middle = top + (number + 0.5) * line if wrapped else box.y + box.height / 2
-            draw.text((box.x + box.width / 2, middle), text, INK, font, anchor="mm")
+        if wrapped:
+            top, line = box.y + round(font.size * 0.4), line_height(font)
+            for number, text in enumerate(wrap_text(title, font, box.width)):
+                write(box, top + (number + 0.5) * line, text, INK)
+        else:
+            write(box, box.y + box.height / 2, shorten(title, font, box.width - 8), INK)
     for box, note in zip(page.panels, notes, strict=False):
         if note:
-            text = shorten(note, font, box.width - 8)
-            draw.text(
-                (box.x + box.width / 2, box.y + box.height / 2), text, FAINT, font, anchor="mm"
-            )
+            write(box, box.y + box.height / 2, shorten(note, font, box.width - 8), FAINT)
+    swatch, gap = _swatch(font)
     for entry, box in zip(page.entries, page.entry_boxes, strict=True):
-        draw_entry(draw, font, page.font_size, entry, box.x, box.y + box.height / 2)
+        left, middle = box.x, box.y + box.height / 2
+        if entry.color != NO_SWATCH:
+            top = round(middle - swatch / 2)
+            outline = tuple(round(value * 0.7) for value in entry.color)
+            corners = (left, top, left + swatch, top + swatch)
+            draw.rounded_rectangle(corners, max(2, font.size // 6), entry.color, outline)
+        draw.text((left + swatch + gap, middle), entry.name, INK, font, anchor="lm")
     return np.asarray(image)
 
 
 def _place_legend(
     size: tuple[int, int],
-    font_size: int,
+    font: Any,
     entries: list[Entry],
     panels: int,
     aspect: float,
     wanted: int | None,
-) -> tuple[list[Entry], list[tuple[int, int]], Box]:
-    """Return the entries with space, their positions, and the rest of the page for the panels."""
+) -> tuple[list[Entry], list[Box], Box]:
+    """Return the entries with space, their rectangles, and the rest of the page for the panels."""
     width, height = size
     page = Box(0, 0, width, height)
     if not entries:
         return [], [], page
     columns, rows = _tiling(width, height, panels, aspect, wanted)
-    font, pad = font_of(font_size), font_size
-    widest = max(entry_width(entry, font, font_size) for entry in entries)
-    if columns * rows > panels:  # the last cell of the tiling is free
-        room = Box(
-            width - width // columns, height - height // rows, width // columns, height // rows
-        )
-        if (
-            _legend_columns(len(entries), room.height - 2 * pad, font_size) * (widest + pad) + pad
-            <= room.width
-        ):
-            return entries, _place_in_columns(room, font_size, len(entries), widest), page
+    pad, line = font.size, line_height(font)
+    widths = [entry_width(entry, font) for entry in entries]
+    step = max(widths) + pad
+
+    def columns_in(height: int) -> int:
+        """Return how many columns hold all entries; a column has at least one row."""
+        return -(-len(entries) // max(1, (height - 2 * pad) // line))
+
+    def placed_in(room: Box) -> list[Box]:
+        """Return the rectangles of all entries, in columns in the middle of a rectangle that is
+        large enough.
+        """
+        columns = columns_in(room.height)
+        rows = -(-len(entries) // columns)
+        left = room.x + (room.width - columns * step + pad) // 2
+        top = room.y + (room.height - rows * line) // 2
+        return [
+            Box(left + i // rows * step, top + i % rows * line, width, line)
+            for i, width in enumerate(widths)
+        ]
+
+    across, down = width // columns, height // rows
+    last = Box(width - across, height - down, across, down)  # cell of the tiling
+    if columns * rows > panels and columns_in(last.height) * step + pad <= last.width:
+        return entries, placed_in(last), page
     # the largest width that the panels can have
     picture = min(round(aspect * columns / rows * height), width)
-    beside = _legend_columns(len(entries), height - 2 * pad, font_size) * (widest + pad) + pad
+    beside = columns_in(height) * step + pad
     if picture + beside <= width or (
         aspect * columns / rows <= 1.2 and beside <= 0.3 * width < 0.5 * height
     ):
         left = max(0, width - picture - beside) // 2
         picture = min(picture, width - beside)
-        room = Box(left + picture, 0, beside, height)
-        return (
-            entries,
-            _place_in_columns(room, font_size, len(entries), widest),
-            Box(left, 0, picture, height),
-        )
-    return _place_below(size, font_size, entries)
-
-
-def _legend_columns(entries: int, height: int, font_size: int) -> int:
-    """Return how many columns hold all entries; a column has at least one row."""
-    return -(-entries // max(1, height // line_height(font_size)))
-
-
-def _place_in_columns(
-    room: Box, font_size: int, entries: int, widest: int
-) -> list[tuple[int, int]]:
-    """Return positions of all entries, in columns in the middle of a rectangle that is large
-    enough.
-    """
-    pad, line = font_size, line_height(font_size)
-    columns = _legend_columns(entries, room.height - 2 * pad, font_size)
-    rows = -(-entries // columns)
-    left = room.x + (room.width - columns * (widest + pad) + pad) // 2
-    top = room.y + (room.height - rows * line) // 2
-    return [(left + (i // rows) * (widest + pad), top + (i % rows) * line) for i in range(entries)]
+        placed = placed_in(Box(left + picture, 0, beside, height))
+        return entries, placed, Box(left, 0, picture, height)
+    return _place_below(size, font, entries)
 
 
 def _place_below(
-    size: tuple[int, int], font_size: int, entries: list[Entry]
-) -> tuple[list[Entry], list[tuple[int, int]], Box]:
+    size: tuple[int, int], font: Any, entries: list[Entry]
+) -> tuple[list[Entry], list[Box], Box]:
     """Place entries in centred rows at the bottom, in at most 40 % of the page; the last entry
     counts those left out.
     """
     width, height = size
-    font, pad, line = font_of(font_size), font_size, line_height(font_size)
-    rows_allowed = max(1, int(0.4 * height) // line)
-    lines: list[list[int]] = []
+    pad, line = font.size, line_height(font)
     for room in range(len(entries), 0, -1):
         shown = entries
         if room < len(entries):
             shown = [*entries[: room - 1], Entry(f"and {len(entries) - room + 1} more", NO_SWATCH)]
-        widths = [entry_width(entry, font, font_size) for entry in shown]
-        lines = wrap_entries(widths, width - 2 * pad, pad)
-        if len(lines) <= rows_allowed:
+        rows = wrap_entries([entry_width(entry, font) for entry in shown], width - 2 * pad, pad)
+        if len(rows) * line <= max(line, 0.4 * height):
             break
-    top = height - len(lines) * line - pad // 2
-    positions = []
-    for number, row in enumerate(lines):
-        x = (width - sum(widths[i] for i in row) - pad * (len(row) - 1)) // 2
-        for i in row:
-            positions.append((max(0, x), top + number * line))
-            x += widths[i] + pad
-    return shown, positions, Box(0, 0, width, max(1, top - pad // 2))
+    top = height - len(rows) * line - pad // 2
+    placed = _place_rows(rows, font, top, lambda length: (width - length) // 2)
+    return shown, placed, Box(0, 0, width, max(1, top - pad // 2))
+
+
+def _place_rows(
+    rows: Sequence[Sequence[int]], font: Any, top: int, left_of: Callable[[int], int]
+) -> list[Box]:
+    """Return the rectangles of entries in rows.
+
+    Args:
+        rows: width of each entry of each row, pixels.
+        font: the font.
+        top: upper edge of the first row.
+        left_of: returns the left edge of a row of a length.
+    """
+    placed, line = [], line_height(font)
+    for number, row in enumerate(rows):
+        x = left_of(sum(row) + font.size * (len(row) - 1))
+        for width in row:
+            placed.append(Box(max(0, x), top + number * line, width, line))
+            x += width + font.size
+    return placed
 
 
 def _tiling(
@@ -273,14 +277,19 @@ def font_of(size: int) -> Any:
     return import_extra("PIL.ImageFont", "render").load_default(size)
 
 
-def line_height(size: int) -> int:
+def line_height(font: Any) -> int:
     """Return the height of a line of text in pixels."""
-    return round(size * 1.6)
+    return round(font.size * 1.6)
 
 
-def entry_width(entry: Entry, font: Any, size: int) -> int:
+def _swatch(font: Any) -> tuple[int, int]:
+    """Return the width of a swatch, and its distance from the name, in pixels."""
+    return round(font.size * 0.95), round(font.size * 0.45)
+
+
+def entry_width(entry: Entry, font: Any) -> int:
     """Return the width of an entry of a legend in pixels: a swatch and a name."""
-    return round(size * 0.95) + round(size * 0.45) + int(np.ceil(font.getlength(entry.name)))
+    return sum(_swatch(font)) + int(np.ceil(font.getlength(entry.name)))
 
 
 def shorten(text: str, font: Any, room: float) -> str:
@@ -317,40 +326,23 @@ def wrap_entries(widths: Sequence[int], room: int, gap: int) -> list[list[int]]:
         gap: distance between two entries of a row, pixels.
 
     Returns:
-        The numbers of the entries of each row.
+        The widths of the entries of each row.
     """
-    fewest = len(_fill(widths, room, gap))
-    limits = range(max(widths), room, 4)
-    return next(
-        (rows for limit in limits if len(rows := _fill(widths, limit, gap)) == fewest),
-        _fill(widths, room, gap),
-    )
+    widest = _fill(widths, room, gap)
+    narrower = (_fill(widths, limit, gap) for limit in range(max(widths), room, 4))
+    return next((rows for rows in narrower if len(rows) == len(widest)), widest)
 
 
 def _fill(widths: Sequence[int], limit: int, gap: int) -> list[list[int]]:
     rows: list[list[int]] = [[]]
     used = 0
-    for index, width in enumerate(widths):
+    for width in widths:
         if rows[-1] and used + gap + width > limit:
             rows.append([])
             used = 0
         used += width + (gap if rows[-1] else 0)
-        rows[-1].append(index)
+        rows[-1].append(width)
     return rows
-
-
-def draw_entry(draw: Any, font: Any, size: int, entry: Entry, left: int, middle: float) -> None:
-    """Draw an entry of a legend, with its left edge and its vertical middle at a position in
-    pixels.
-    """
-    swatch = round(size * 0.95)
-    top = round(middle - swatch / 2)
-    if entry.color != NO_SWATCH:
-        outline = tuple(round(value * 0.7) for value in entry.color)
-        draw.rounded_rectangle(
-            (left, top, left + swatch, top + swatch), max(2, size // 6), entry.color, outline
-        )
-    draw.text((left + swatch + round(size * 0.45), middle), entry.name, INK, font, anchor="lm")
 
 
 def draw_legend(entries: Sequence[Entry], font_size: int, most_width: int) -> Uint8Array:
@@ -365,16 +357,10 @@ def draw_legend(entries: Sequence[Entry], font_size: int, most_width: int) -> Ui
     Returns:
         (height, width, 3) uint8 RGB.
     """
-    font, line, margin = font_of(font_size), line_height(font_size), max(2, font_size // 4)
-    widths = [entry_width(entry, font, font_size) for entry in entries]
+    font, margin = font_of(font_size), max(2, font_size // 4)
+    widths = [entry_width(entry, font) for entry in entries]
     rows = wrap_entries(widths, most_width - 2 * margin, font_size)
-    lengths = [sum(widths[i] for i in row) + font_size * (len(row) - 1) for row in rows]
-    size = (max(lengths) + 2 * margin, len(rows) * line + 2 * margin)
-    image = import_extra("PIL.Image", "render").new("RGB", size, (255, 255, 255))
-    draw = import_extra("PIL.ImageDraw", "render").Draw(image)
-    for number, row in enumerate(rows):
-        left = margin
-        for i in row:
-            draw_entry(draw, font, font_size, entries[i], left, margin + (number + 0.5) * line)
-            left += widths[i] + font_size
-    return np.asarray(image)
+    placed = _place_rows(rows, font, margin, lambda _: margin)
+    width = max(box.x + box.width for box in placed) + margin
+    height = placed[-1].y + placed[-1].height + margin
+    return draw_page(Page((width, height), font_size, [], [], placed, list(entries)), [])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from string import ascii_lowercase
@@ -19,13 +19,13 @@ from carlasc.viewing.colors import Entry, merge_legends
 from carlasc.viewing.rendering.actor_boxes import BOX, boxes_in, with_boxes
 from carlasc.viewing.rendering.cameras import CameraOptions, View, Viewpoint
 from carlasc.viewing.rendering.drawings import (
+    EVIDENCE,
     VELOCITY,
     Drawing,
     Extent,
     GridColor,
     error_drawing,
     evidence_drawing,
-    evidence_legend,
     flow_drawing,
     grid_drawing,
     grid_extent,
@@ -141,7 +141,7 @@ class FrameRenderer:
         colors, legends = self.reader.colors, []
         for content in self.reader.contents:
             if content == "grid" and self.color != "class":
-                legends.append(evidence_legend(self.color))
+                legends.append(EVIDENCE[self.color].legend)
                 if self.color == "actor" and self.reader.has(f"{self.reader.data.grid}/velocity"):
                     legends.append([VELOCITY])
             elif (
@@ -217,42 +217,40 @@ class Cell(NamedTuple):
     frame: int
 
 
-@dataclass(frozen=True, eq=False)
-class PictureRenderer:
-    """Draws pictures of cells.
+def draw_shot(
+    shot: tuple[Sequence[Cell], Viewpoint],
+    sheet: Sheet,
+    legend: Sequence[Entry],
+    captions: Sequence[str],
+    columns: int | None,
+) -> Uint8Array:
+    """Return the picture of some cells from a viewpoint, (H, W, 3) uint8.
 
-    Attributes:
+    Args:
+        shot: the cells and the viewpoint.
         sheet: size and font size.
         legend: entries of the legend, the same in all pictures; empty for no legend.
         captions: texts below the panels; empty for titles of the contents.
         columns: number of panels in a row; None takes the number with which panels are largest.
     """
-
-    sheet: Sheet
-    legend: list[Entry] = field(default_factory=list)
-    captions: tuple[str, ...] = ()
-    columns: int | None = None
-
-    def render(self, shot: tuple[Sequence[Cell], Viewpoint]) -> Uint8Array:
-        """Return the picture of some cells from a viewpoint, (H, W, 3) uint8."""
-        cells, viewpoint = shot
-        panels = [panel for cell in cells for panel in cell.renderer.panels(cell.frame)]
-        if self.captions:
-            extent = np.concatenate([panel.drawing.extent for panel in panels])
-            panels = [
-                replace(panel, title=caption, fixed_view=panel.fixed_view or (extent, np.eye(4)))
-                for panel, caption in zip(panels, self.captions, strict=True)
-            ]
-        return draw_panels(
-            panels,
-            viewpoint=viewpoint,
-            size=self.sheet.size,
-            legend=self.legend,
-            axes=cells[0].renderer.reader.axes,
-            captioned=bool(self.captions),
-            columns=self.columns,
-            font_size=self.sheet.font_size,
-        )
+    cells, viewpoint = shot
+    panels = [panel for cell in cells for panel in cell.renderer.panels(cell.frame)]
+    if captions:
+        extent = np.concatenate([panel.drawing.extent for panel in panels])
+        panels = [
+            replace(panel, title=caption, fixed_view=panel.fixed_view or (extent, np.eye(4)))
+            for panel, caption in zip(panels, captions, strict=True)
+        ]
+    return draw_panels(
+        panels,
+        viewpoint=viewpoint,
+        size=sheet.size,
+        legend=legend,
+        axes=cells[0].renderer.reader.axes,
+        captioned=bool(captions),
+        columns=columns,
+        font_size=sheet.font_size,
+    )
 
 
 def plan_cells(renderers: Sequence[FrameRenderer], film: bool) -> list[list[Cell]]:

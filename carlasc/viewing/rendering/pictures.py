@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import get_args
 
 import numpy as np
 
@@ -32,7 +31,7 @@ from carlasc.viewing.rendering.drawings import (
     grid_drawing,
     scan_drawing,
 )
-from carlasc.viewing.rendering.pages import Page, draw_page, plan_page
+from carlasc.viewing.rendering.pages import draw_page, plan_page
 
 DEFAULT_SIZE = (1280, 720)
 
@@ -91,8 +90,7 @@ def draw_panels(
     """
     if not panels:
         raise ArgumentError("panels", expected="at least one", found="none")
-    if axes not in get_args(Axes):
-        raise ArgumentError("axes", expected=" or ".join(get_args(Axes)), found=repr(axes))
+    check_choice("axes", axes, Axes)
     for panel in panels:
         check_choice("view", panel.view, VIEWS)
     entries = (
@@ -111,10 +109,17 @@ def draw_panels(
         columns=columns,
         font_size=font_size,
     )
-    pictures = [
-        _draw(panel, page, number, viewpoint or Viewpoint(), axes)
-        for number, panel in enumerate(panels)
-    ]
+    pictures = []
+    for panel, box in zip(panels, page.panels, strict=True):
+        extent, drawing_T_view = panel.fixed_view or (panel.drawing.extent, None)
+        aspect = box.width / box.height
+        if panel.view == "bev":
+            camera = birdseye_camera(extent, aspect, axes=axes)
+        else:
+            camera = perspective_camera(extent, viewpoint or Viewpoint(), aspect, axes=axes)
+        if drawing_T_view is not None:
+            camera = camera.moved(drawing_T_view)
+        pictures.append(panel.drawing.render(camera, box.width, box.height, axes=axes))
     return draw_page(
         page, pictures, titles, [panel.drawing.note for panel in panels], wrapped=captioned
     )
@@ -262,16 +267,3 @@ def render_comparison(
     if errors:
         panels.append(Panel(error_drawing(prediction, truth, ego=ego), view, "errors"))
     return draw_panels(panels, viewpoint=viewpoint, size=size, legend=legend, axes=axes)
-
-
-def _draw(panel: Panel, page: Page, number: int, viewpoint: Viewpoint, axes: Axes) -> Uint8Array:
-    box = page.panels[number]
-    aspect = box.width / box.height
-    extent = panel.drawing.extent if panel.fixed_view is None else panel.fixed_view[0]
-    if panel.view == "bev":
-        camera = birdseye_camera(extent, aspect, axes=axes)
-    else:
-        camera = perspective_camera(extent, viewpoint, aspect, axes=axes)
-    if panel.fixed_view is not None:
-        camera = camera.moved(panel.fixed_view[1])
-    return panel.drawing.render(camera, box.width, box.height, axes=axes)

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,9 @@ from carlasc.viewing.rendering.cameras import CameraOptions, Viewpoint
 from carlasc.viewing.rendering.drawings import GridColor, check_color
 from carlasc.viewing.rendering.encoding import (
     FILMS,
+    NAME_A_FILM,
     STILLS,
+    check_single,
     encodable_size,
     is_film,
     write_pictures,
@@ -33,9 +36,9 @@ from carlasc.viewing.rendering.pages import draw_legend
 from carlasc.viewing.rendering.panels import (
     Cell,
     FrameRenderer,
-    PictureRenderer,
     caption_panels,
     columns_of,
+    draw_shot,
     plan_cells,
 )
 from carlasc.viewing.rendering.styles import StyleOptions
@@ -141,7 +144,7 @@ def render(
     """
     started = time.monotonic()
     together = not isinstance(source, _ONE)
-    scenes = [as_scene(source)] if isinstance(source, _ONE) else [as_scene(one) for one in source]
+    scenes = [as_scene(one) for one in ([source] if isinstance(source, _ONE) else source)]
     if not scenes:
         raise ArgumentError("source", expected="at least one source", found="none")
     if not together and (style.captions or style.columns is not None):
@@ -163,23 +166,20 @@ def render(
 
     renderers = [FrameRenderer(reader, camera, style.ego, color, boxes) for reader in readers]
     pictures = plan_cells(renderers, film)
-    shown = (
-        [cell.renderer.legend_of(cell.frame) for cells in pictures for cell in cells]
-        if style.legend
-        else []
-    )
-    entries = merge_legends(shown)
+    shown = [cell for cells in pictures for cell in cells]
+    entries = merge_legends(c.renderer.legend_of(c.frame) for c in shown if style.legend)
     sheet = replace(style.sheet, size=encodable_size(target, style.sheet.size))
-    drawer = PictureRenderer(
-        sheet,
-        [] if sheet.legend_apart else entries,
-        caption_panels(pictures[0], style.captions, film) if together else (),
-        style.columns or (columns_of(pictures[0]) if together else None),
+    draw = partial(
+        draw_shot,
+        sheet=sheet,
+        legend=[] if sheet.legend_apart else entries,
+        captions=caption_panels(pictures[0], style.captions, film) if together else (),
+        columns=style.columns or (columns_of(pictures[0]) if together else None),
     )
     shots = _plan_shots(pictures, camera)
     if fps is None:
         fps = _ORBIT_FPS if camera.orbit and len(pictures) == 1 else _DRIVE_FPS
-    with closing(run_all(drawer.render, shots, run)) as drawn:
+    with closing(run_all(draw, shots, run)) as drawn:
         write_pictures(target, _reported(drawn, len(shots), run.progress), fps, sheet.dpi)
     if legend_file is not None and entries and sheet.font_size is not None:
         write_pictures(
@@ -189,7 +189,7 @@ def render(
         target,
         ", ".join(dict.fromkeys(reader.path for reader in readers)),
         readers[0].contents,
-        tuple(sorted({cell.frame for cells in pictures for cell in cells})),
+        tuple(sorted({cell.frame for cell in shown})),
         len(shots),
         sheet.size,
         readers[0].table.name,
@@ -230,12 +230,10 @@ def _check_kind(
 
     `alone` is the reader if each of its frames is a picture of its own, or None.
     """
-    advice = "name a .gif, .mp4 or .webp"
-    if not film and alone is not None and len(alone.frames) > 1:
-        found = f"{len(alone.frames)} frames for {target.name}"
-        raise ArgumentError("out", expected="a single frame for a PNG", found=found, advice=advice)
+    if alone is not None:
+        check_single(target, alone.frames)
     if orbit and not film:
-        raise ArgumentError("orbit", expected="a film", found=target.name, advice=advice)
+        raise ArgumentError("orbit", expected="a film", found=target.name, advice=NAME_A_FILM)
     if style.name == "paper" and film:
         raise ArgumentError(
             "style", expected="screen for a film", found=style.name, advice="name a .png"

@@ -8,10 +8,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
 
 from carlasc.core.choices import StyleName as StyleName  # noqa: PLC0414 (part of this module)
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, check_choice
 
 SMALLEST, LARGEST = (64, 64), 16384  # pixels of a picture
 
@@ -24,7 +23,8 @@ _PAPER_SIZE, _PAPER_DPI, _PAPER_FONT_PT = (
 )
 _INCHES = {"cm": 1 / 2.54, "mm": 1 / 25.4, "in": 1.0}
 _POINTS_PER_INCH = 72
-_LENGTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)")
+_LENGTH = r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*?)\s*"
+_SIZE = re.compile(f"{_LENGTH}x{_LENGTH}")
 
 
 @dataclass(frozen=True)
@@ -59,10 +59,7 @@ class StyleOptions:
     ego: bool = True
 
     def __post_init__(self) -> None:
-        if self.name not in get_args(StyleName):
-            raise ArgumentError(
-                "style", expected=" or ".join(get_args(StyleName)), found=repr(self.name)
-            )
+        check_choice("style", self.name, StyleName)
         if self.dpi is not None and not 30 <= self.dpi <= 2400:
             raise ArgumentError("dpi", expected="30 to 2400 pixels per inch", found=f"{self.dpi:g}")
         if self.columns is not None and self.columns < 1:
@@ -125,14 +122,9 @@ def _read_lengths(text: str) -> tuple[tuple[float, float], bool]:
     """Return the two lengths of a text, in inches if they have a unit, otherwise in pixels; and
     whether they have one.
     """
-    lengths = [
-        _LENGTH.fullmatch(part.strip())
-        for part in re.split(r"\s*x\s*", text.strip().lower(), maxsplit=1)
-    ]
-    pairs = [(float(match[1]), match[2]) for match in lengths if match is not None]
-    if len(pairs) == 2:
-        (width, first), (height, second) = pairs
-        first = first or second  # in 8.8x5cm, both are centimetres
+    if match := _SIZE.fullmatch(text.lower()):
+        width, height = float(match[1]), float(match[3])
+        first, second = match[2] or match[4], match[4]  # in 8.8x5cm, both are centimetres
         if first == second == "":
             if width.is_integer() and height.is_integer():
                 return (width, height), False

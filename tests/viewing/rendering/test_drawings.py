@@ -9,7 +9,7 @@ from carlasc.storage import layout
 from carlasc.storage.files import to_json
 from carlasc.storage.folder import FolderSink
 from carlasc.viewing import CameraOptions, Scene, StyleOptions, render
-from carlasc.viewing.rendering.drawings import evidence_legend
+from carlasc.viewing.rendering.drawings import EVIDENCE
 
 pytest.importorskip("embreex")
 
@@ -86,13 +86,13 @@ def test_each_block_has_the_colour_of_its_value(certain, tmp_path, color):
         camera=CameraOptions(view="bev"),
         style=StyleOptions(ego=False, legend=False, size=(400, 400)),
     ).out
-    columns = colors_of(path, evidence_legend(color))
+    columns = colors_of(path, EVIDENCE[color].legend)
     assert tuple(sorted(columns, key=columns.get)) == SHOWN[color]  # from left to right
 
 
 @pytest.mark.parametrize("color", sorted(SHOWN))
 def test_the_legend_names_what_the_colours_mean(certain, tmp_path, color):
-    legend = evidence_legend(color)
+    legend = EVIDENCE[color].legend
     assert (
         len({entry.name for entry in legend})
         == len({entry.color for entry in legend})

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from helpers.errors import raises
 from helpers.readers.pixels import (
     BLUE,
     RED,
@@ -318,7 +319,7 @@ def test_an_unknown_view_is_refused(view):
 
 
 def test_unknown_axes_are_refused():
-    with pytest.raises(ArgumentError, match="axes: expected left or right, found 'up'"):
+    with raises(ArgumentError, where="axes", expected="left, right", found="up"):
         render_grid(grid_with({}), axes="up", size=SIZE)
 
 

@@ -125,7 +125,7 @@ def test_a_legend_alone_is_as_narrow_as_asked_and_clips_nothing():
         assert (legend[:, [0, -1]] == 255).all() and (legend[[0, -1]] == 255).all()
     assert heights[0] > heights[1] > heights[2]
     narrow = draw_legend(entries[:1], 20, 10)
-    assert narrow.shape[1] >= entry_width(entries[0], font_of(20), 20)
+    assert narrow.shape[1] >= entry_width(entries[0], font_of(20))
 
 
 def test_captions_are_broken_into_at_most_three_lines_that_fit():
