@@ -242,8 +242,8 @@ class WholeFiles:
             return self._ends_as_zip(entry.file(frame), size)
         if entry.per == "point":
             other = layout.SCAN_FIELDS["labels" if name == "points" else "points"]
-            rows, beside = size / _row(entry), self._size(other, frame)
-            return rows.is_integer() and (beside is None or beside / _row(other) == rows)
+            rows, beside = size / entry.row_bytes, self._size(other, frame)
+            return rows.is_integer() and (beside is None or beside / other.row_bytes == rows)
         return size > 0
 
     def forget(self, grid: str) -> None:
@@ -272,7 +272,3 @@ class WholeFiles:
                 return None
             self._cells[grid] = math.prod(spec.size)
         return self._cells[grid]
-
-
-def _row(entry: field_files.Field) -> int:
-    return np.dtype(entry.dtype).itemsize * (entry.columns or 1)

@@ -143,10 +143,9 @@ class FieldTable:
         self.where = tree.where(path)
         with opened(tree, path) as file:
             self._metadata = file.metadata
-            about = parse_json(file.metadata.metadata[b"carlasc"], self.where)
-            self._types = column_types(
-                layout.field_named(field), check_attributes(about, self.where)
-            )
+            written = parse_json(file.metadata.metadata[b"carlasc"], self.where)
+            about = check_attributes(written, self.where)
+            self._types = column_types(layout.field_named(field), about)
             _check_types(file.schema_arrow, self._types, self.where)
         self.attributes = about
         frames, rows = (_counts(about.get(name)) for name in ("frames", "rows"))
