@@ -4,20 +4,22 @@ sequence.
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar, cast
 
 import numpy as np
 
 from carlasc.core.arrays import AnyArray, IntArray
 from carlasc.core.grids import Coordinates
-from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, within
 from carlasc.storage import layout
-from carlasc.storage.files import damaged, leads_outside
+from carlasc.storage.files import damaged, leads_outside, unfinished
 from carlasc.storage.layout import identity_of
-from carlasc.storage.packed.output import unfinished_error
+from carlasc.storage.packed.output import refuse_existing, unfinished_error
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter, Sink
 
@@ -199,15 +201,52 @@ class PackedSequence(Sequence, Generic[_FieldReader]):
 
 
 class PackedSink(Sink):
-    """Writes a packed store by appending. One writer writes one sequence after the other."""
+    """Writes a packed store by appending. One writer writes one sequence after the other.
 
-    @abstractmethod
+    The store gets its final name only when the sink is finished.
+
+    Attributes:
+        path: final path of the store.
+        part: path of the unfinished store.
+        options: options of the store.
+        overwrite: whether an existing store is replaced.
+        nodes: the group (or folder) of each completed sequence.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], options: PackOptions | None, overwrite: bool
+    ) -> None:
+        """Check the options and the path. Nothing is written yet.
+
+        Raises:
+            ArgumentError: `small` is given, but only zarr has PCodec.
+            ConflictError: something exists at `path`, and `overwrite` is not given.
+        """
+        self.path, self.location = Path(path), str(path)
+        self.part = unfinished(self.path)
+        self.options = options or PackOptions()
+        self.overwrite = overwrite
+        self.nodes: dict[str, str] = {}
+        if self.options.small:
+            raise ArgumentError(
+                "small",
+                expected="a .zarr store",
+                found=f"{path}: only zarr has PCodec",
+                advice="leave `small` out",
+            )
+        refuse_existing(self.path, overwrite)
+
     def finished(self, path: str) -> bool:
-        """Whether an interrupted run has completed this sequence."""
+        """Whether this sequence is complete."""
+        return path in self.nodes
 
     @abstractmethod
-    def sequence(self, path: str) -> PackedWriter:
+    def sequence(self, path: str) -> PackedWriter[Any]:
         """Start a sequence. An incomplete sequence of an interrupted run is removed."""
+
+    def root(self) -> dict[str, Any]:
+        """Return the attributes of the root of the finished store."""
+        return {"type": STORE, "version": VERSION, "complete": True, "sequences": self.nodes}
 
 
 class FieldWriter(ABC):
@@ -215,12 +254,12 @@ class FieldWriter(ABC):
 
     Attributes:
         entry: the field in the layout.
-        frames: the frames written so far, in order.
+        frames: the frames written so far, in order, each with the result of `write`.
     """
 
     def __init__(self, field: str) -> None:
         self.entry = layout.field_named(field)
-        self.frames: dict[int, None] = {}
+        self.frames: dict[int, Any] = {}
 
     def append(self, frame: int, array: AnyArray) -> None:
         """Write one frame.
@@ -234,46 +273,59 @@ class FieldWriter(ABC):
                 "its number", expected=f"frames in rising order, above {last}", found=str(frame)
             )
         self.entry.check(array, "its array")
-        self.write(frame, array)
-        self.frames[frame] = None
+        self.frames[frame] = self.write(frame, array)
 
     @abstractmethod
-    def write(self, frame: int, array: AnyArray) -> None:
-        """Write one frame that fits the field."""
+    def write(self, frame: int, array: AnyArray) -> Any:
+        """Write one frame that fits the field, and return its number of elements."""
 
     @abstractmethod
     def close(self) -> None:
         """Write buffered data."""
 
 
-class PackedWriter(SequenceWriter):
+_FieldWriter = TypeVar("_FieldWriter", bound=FieldWriter)
+
+
+class PackedWriter(SequenceWriter, Generic[_FieldWriter]):
     """Writes one sequence of a packed store, with the frames of each field in ascending order.
 
     Attributes:
         identity: split, name and coordinates; by default those of the path.
+        node: group (or folder) of the sequence in the store.
+        options: options of the store.
         writers: the fields written so far.
         contents: the text files written so far.
     """
 
-    def __init__(self, location: str, path: str) -> None:
-        self.location = location
+    def __init__(self, sink: PackedSink, path: str, node: str) -> None:
+        self.location = f"{sink.part}/{node}"
         self.path = path
+        self.node = node
+        self.options = sink.options
         self.identity: tuple[str | None, str, Coordinates] = identity_of(path)
-        self.writers: dict[str, FieldWriter] = {}
+        self.writers: dict[str, _FieldWriter] = {}
         self.contents: dict[str, bytes] = {}
+        self._finished = sink.nodes
 
     @abstractmethod
-    def _start_field(self, field: str) -> FieldWriter: ...
+    def _start_field(self, field: str) -> _FieldWriter: ...
+
+    @abstractmethod
+    def _finish(self) -> None:
+        """Write everything but the fields, and mark the sequence as complete."""
+
+    def close(self) -> None:
+        """Write buffered frames and mark the sequence as complete."""
+        for writer in self.writers.values():
+            writer.close()
+        self._finish()
+        self._finished[self.path] = self.node
 
     def __getstate__(self) -> dict[str, Any]:
         """Keep only the name, because only one process writes the store."""
-        return {
-            "location": self.location,
-            "path": self.path,
-            "identity": self.identity,
-            "writers": {},
-            "contents": {},
-        }
+        kept = ("location", "path", "identity")
+        return {name: vars(self)[name] for name in kept} | {"writers": {}, "contents": {}}
 
     def has(self, field: str, frame: int) -> bool:
         """Whether this run has written the frame."""
@@ -289,10 +341,8 @@ class PackedWriter(SequenceWriter):
         if field not in self.writers:
             check_names([field], self.location)
             self.writers[field] = self._start_field(field)
-        try:
+        with within(f"{self.location}: field {field}, frame {frame}"):
             self.writers[field].append(frame, array)
-        except FormatError as error:
-            raise error.within(f"{self.location}: field {field}, frame {frame}") from error
 
     def write_document(self, name: str, data: bytes) -> None:
         """Keep a text file's bytes until the sequence is closed."""
