@@ -23,7 +23,6 @@ import numpy as np
 from carlasc.core.arrays import AnyArray
 from carlasc.errors import FormatError, MissingDataError, reading
 
-_LONGEST_HEADER = 1 << 14  # bytes; NumPy refuses headers of more than 10,000
 # bytes: smaller arrays are unpacked at any compression ratio: zeros compress very well
 _SMALL = 1 << 26  # fact: small-array
 _MOST_RATIO = 100  # largest compression ratio of larger arrays; Deflate reaches 1032
@@ -79,16 +78,12 @@ def parse_npy(data: bytes | memoryview, expected: ArrayFormat, where: str) -> An
         where: the file, for errors.
 
     Returns:
-        The array, in C order. It may be read-only.
+        The array, in C order.
 
     Raises:
         FormatError: the file has another type, shape or size, or is no .npy file.
     """
-    shape, fortran_order, dtype, start = _check_header(
-        io.BytesIO(data[:_LONGEST_HEADER]), len(data), expected, where
-    )
-    values = np.frombuffer(data, dtype, math.prod(shape), start)
-    return np.asarray(values.reshape(shape, order="F" if fortran_order else "C"), order="C")
+    return _read_array(io.BytesIO(data), len(data), expected, where)
 
 
 def read_npy(path: str | Path, expected: ArrayFormat) -> AnyArray:
@@ -162,7 +157,7 @@ class NpzFile:
             reading(where, "a .npy array in a whole zip"),
             self._archive.open(self._members[name]) as stream,
         ):
-            return _npy_header(stream)[2]
+            return _npy_header(stream)[1]
 
     def read(self, name: str, expected: ArrayFormat) -> AnyArray:
         """Return an array, in C order.
@@ -249,20 +244,20 @@ def _opened(path: str | Path) -> Iterator[IO[bytes]]:
         yield file
 
 
-def _npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return shape, whether the order is Fortran, and type from the header of a .npy file."""
+def _npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Return shape and type from the header of a .npy file."""
     version = np.lib.format.read_magic(stream)
     if version not in _READERS:
         raise ValueError(f"version {version} of the .npy format")
-    header: tuple[tuple[int, ...], bool, np.dtype[Any]] = _READERS[version](stream)
-    return header
+    shape, _, dtype = _READERS[version](stream)
+    return shape, dtype
 
 
 def _read_array(
     stream: IO[bytes], length: int, expected: ArrayFormat, where: str, packed: int | None = None
 ) -> AnyArray:
     """Return the array of a .npy file of `length` bytes, which are `packed` bytes in a zip."""
-    shape, *_ = _check_header(stream, length, expected, where)
+    shape = _check_header(stream, length, expected, where)
     if packed is not None:
         check_ratio(length, packed, where)
     with reading(where, "a .npy array"):
@@ -274,17 +269,14 @@ def _read_array(
 
 def _check_header(
     stream: IO[bytes], length: int, expected: ArrayFormat, where: str
-) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
-    """Read the header of a .npy file, and check it against the expected format and the length of
-    the file.
+) -> tuple[int, ...]:
+    """Read the header of a .npy file, check it against the expected format and the length of the
+    file, and return the shape.
 
     NumPy parses its text as a Python literal of at most 10,000 characters. No code is run.
-
-    Returns:
-        Shape, whether the order is Fortran, type, and the first byte of the values.
     """
     with reading(where, "a .npy array"):
-        shape, fortran_order, dtype = _npy_header(stream)
+        shape, dtype = _npy_header(stream)
         start = stream.tell()
     wanted, count = expected.shape, math.prod(shape)
     # An empty array of shape (0,) is accepted as (0, K): CarlaSC has such files for an empty list
@@ -315,7 +307,7 @@ def _check_header(
             found=str(length),
             advice="the file is cut short, or something was added",
         )
-    return shape, fortran_order, dtype, start
+    return shape
 
 
 def _text(shape: tuple[int | None, ...]) -> str:

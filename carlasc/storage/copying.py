@@ -228,16 +228,16 @@ def unpack(
     source = as_source(source)
     refuse_overlap(out, source)
     result = UnpackResult(str(out) if is_url(out) else Path(out))
-    in_place = overwrite or run.part.count > 1 or not isinstance(result.out, Path)
-    if isinstance(result.out, Path) and result.out.exists() and not in_place:
+    # renamed when it is complete; object stores and several parts write to their place
+    final = None if is_url(out) or overwrite or run.part.count > 1 else Path(out)
+    if final is not None and final.exists():
         raise ConflictError(
-            result.out,
+            final,
             expected="a new path",
-            found="a folder" if result.out.is_dir() else "a file",
+            found="a folder" if final.is_dir() else "a file",
             advice="choose another name, or give `overwrite=True`",
         )
-    folder = result.out if in_place or not isinstance(result.out, Path) else unfinished(result.out)
-    sink, blocks = FolderSink(folder), []
+    sink, blocks = FolderSink(result.out if final is None else unfinished(final)), []
     for path, sequence in source.sequences().items():
         result.sequences.append(path)
         writer = sink.sequence(path)
@@ -248,7 +248,7 @@ def unpack(
             copy_documents(sequence, writer)
         blocks += blocks_of(sequence, writer, _BLOCK)
     result.files, result.kept = copy_blocks(blocks, run, again=overwrite)
-    if isinstance(folder, Path) and isinstance(result.out, Path) and folder != result.out:
-        put_in_place(folder, result.out, overwrite=False)
+    if final is not None:
+        put_in_place(unfinished(final), final, overwrite=False)
     result.elapsed_s = time.perf_counter() - began
     return result

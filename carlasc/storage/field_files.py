@@ -26,6 +26,7 @@ TABLES = {
 # Level 6, the default of zlib, takes 6 times as long and saves only 3 %: the voxels of votes are
 # sorted, so repeats are always four bytes apart.
 _LEVELS = {"votes": (1, 4, 4), "velocities": (4, 4)}  # of the columns
+_READ_FIRST = ("label", "voxel", "velocity", "votes")  # the order in which columns are read
 _MOST_CLASSES = 256
 
 Per = Literal["point", "voxel", "vote", "moving voxel", "box", "scan"]
@@ -121,8 +122,9 @@ class Field:
                 found=str(size),
                 advice="the file is cut short, or belongs to another grid",
             )
-        if size % self.row_bytes:
-            row = f"{self.columns} {dtype.name} per row" if self.columns else f"one {self.per}"
+        columns = self.columns
+        if size % (dtype.itemsize * (columns or 1)):
+            row = f"{columns} {dtype.name} per row" if columns else f"one {self.per}"
             raise FormatError(
                 where,
                 expected=f"a multiple of {self.row_bytes} bytes ({row})",
@@ -132,7 +134,7 @@ class Field:
         array = np.frombuffer(data, dtype)
         if shape is not None:
             return array.reshape(shape)
-        return array if self.columns is None else array.reshape(-1, self.columns)
+        return array if columns is None else array.reshape(-1, columns)
 
     def size_of(self, shape: tuple[int, ...] | None) -> int | None:
         """Return the size in bytes of a file of a grid with this shape; None if it is known only
@@ -189,7 +191,7 @@ def _decode_npz(
     tables, columns = TABLES[kind], dict[str, AnyArray]()
     count: int | None = None
     with open_npz(data, where) as archive:
-        for name in tables[0].names or ():
+        for name in sorted(tables[0].names or (), key=_READ_FIRST.index):
             dtypes = tuple(table[name].base.str for table in tables)
             wanted = ArrayFormat(dtypes, (count, *tables[0][name].shape), most)
             columns[name] = archive.read(name, wanted)

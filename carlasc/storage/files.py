@@ -238,9 +238,13 @@ def storage_error(path: Path, error: OSError) -> StorageError:
     )
 
 
-def damaged(where: str | os.PathLike[str], expected: str, found: str) -> FormatError:
-    """Return the error of a store whose parts do not fit each other."""
-    return FormatError(where, expected=expected, found=found, advice="the store is damaged")
+def damaged(
+    where: str | os.PathLike[str], expected: str, found: str, advice: str = "the store is damaged"
+) -> FormatError:
+    """Return the error of a file or a store that is damaged, or whose parts do not fit each
+    other.
+    """
+    return FormatError(where, expected=expected, found=found, advice=advice)
 
 
 def write_json(path: Path, value: Any) -> None:

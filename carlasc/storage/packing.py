@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -31,7 +31,6 @@ from carlasc.storage.opening import as_source, open, open_sink
 from carlasc.storage.packed.stores import PackedSink, PackedSource, PackOptions, check_names
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.published import PublishedSequence
-from carlasc.storage.sinks import SequenceWriter
 from carlasc.storage.transport.trees import is_url
 
 if TYPE_CHECKING:
@@ -201,49 +200,33 @@ def _writing(out: object) -> Iterator[None]:
 def _append(
     sequences: Mapping[str, Sequence], sink: PackedSink, progress: Progress | None, threads: int
 ) -> dict[str, int]:
-    """Pack sequences one after the other, and return their published bytes by field."""
-    files = sum(
-        len(sequence.frames(name)) for sequence in sequences.values() for name in sequence.fields()
-    )
+    """Pack sequences one after the other, field by field, and return their published bytes by
+    field. Of sequences that are already packed, only the bytes are added up.
+    """
+    frames_of = {
+        path: {name: sequence.frames(name).tolist() for name in sorted(sequence.fields())}
+        for path, sequence in sequences.items()
+    }
+    files = sum(len(frames) for fields in frames_of.values() for frames in fields.values())
     step = StepCounter(progress, files)
     published: Counter[str] = Counter()
     for path, sequence in sequences.items():
-        finished = sink.finished(path)
-        with nullcontext() if finished else sink.sequence(path) as writer:
+        documents = {name: sequence.read_document(name) for name in sequence.documents()}
+        published["documents"] += sum(map(len, documents.values()))
+        with nullcontext() if sink.finished(path) else sink.sequence(path) as writer:
             if writer is not None:
                 writer.identity = (sequence.split, sequence.name, sequence.coordinates)
-            _append_sequence(sequence, writer, published, step, threads)
+                for name, data in documents.items():
+                    writer.write_document(name, data)
+                writer.expect(frames_of[path], typical_rows(sequence))
+            for name, frames in frames_of[path].items():
+                dtype = layout.field_named(name).dtype
+                for frame, array in _read_ahead(sequence, name, frames, threads):
+                    if writer is not None:
+                        writer.write(name, frame, array)
+                    published[name] += array.size * np.dtype(dtype or array.dtype).itemsize
+                    step(1)
     return dict(published)
-
-
-def _append_sequence(
-    sequence: Sequence,
-    writer: SequenceWriter | None,
-    published: Counter[str],
-    step: Callable[[int], None],
-    threads: int,
-) -> None:
-    """Copy a sequence field by field and add up its published bytes.
-
-    `writer` is None if the sequence is already packed.
-    """
-    documents = {name: sequence.read_document(name) for name in sequence.documents()}
-    published["documents"] += sum(map(len, documents.values()))
-    if writer is not None:
-        for name, data in documents.items():
-            writer.write_document(name, data)
-        writer.expect(
-            {name: sequence.frames(name).tolist() for name in sequence.fields()},
-            typical_rows(sequence),
-        )
-    for name in sorted(sequence.fields()):
-        entry, frames = layout.field_named(name), sequence.frames(name).tolist()
-        for frame, array in _read_ahead(sequence, name, frames, threads):
-            if writer is not None:
-                writer.write(name, frame, array)
-            itemsize = np.dtype(entry.dtype).itemsize if entry.dtype else array.itemsize
-            published[name] += array.size * itemsize
-            step(1)
 
 
 def _read_ahead(

@@ -14,7 +14,7 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import ItemsView, Iterable, Iterator, Mapping, ValuesView
 from functools import cached_property
-from typing import Any, Protocol, Self, cast
+from typing import Any, Self, cast
 
 import numpy as np
 
@@ -27,29 +27,11 @@ from carlasc.core.grids import Coordinates, Grid, GridSpec
 from carlasc.core.notebook import describe
 from carlasc.core.scans import Scan
 from carlasc.core.tables import table_from_json
-from carlasc.errors import FormatError, MissingDataError, MissingKeyError, first_names
+from carlasc.errors import FormatError, MissingDataError, MissingKeyError, first_names, within
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json
 from carlasc.storage.metadata import Metadata
-
-
-class FileTree(Protocol):
-    """The part of a tree of files, local or remote, that this protocol uses.
-
-    Attributes:
-        location: its name in errors: a folder, a zip, a URL.
-    """
-
-    location: str
-
-    def read(self, path: str, size: int | None = None) -> bytes | memoryview:
-        """Return a file's bytes.
-
-        Args:
-            path: the file, its parts joined by "/".
-            size: expected size in bytes; None if it is not known.
-        """
-        ...
+from carlasc.storage.transport.trees import Tree
 
 
 class Sequence(ABC):
@@ -73,7 +55,7 @@ class Sequence(ABC):
     split: str | None
     name: str
     coordinates: Coordinates
-    tree: FileTree | None = None
+    tree: Tree | None = None
     _given_poses: FloatArray | None = None
 
     @abstractmethod
@@ -354,10 +336,8 @@ class Sequence(ABC):
             if name in wanted & self.fields()
         }
         own = {name: read.pop(name) for name in ("labels", "flow", "instances") if name in read}
-        try:
+        with within(f"{self.location}: frame {frame}"):
             return Scan(points[:, :3], remission=points[:, 3], **own, others=read, boxes=boxes)
-        except FormatError as error:
-            raise error.within(f"{self.location}: frame {frame}") from error
 
     def boxes(self, frame: int) -> Boxes | None:
         """Read the tracked boxes of a frame; None if the frame is not annotated.
@@ -379,10 +359,8 @@ class Sequence(ABC):
             )
         counts = self.read(f"{name}/counts", frame) if f"{name}/counts" in self.fields() else None
         labels = cast(LabelArray, self.read(f"{name}/labels", frame))
-        try:
+        with within(f"{self.location}: frame {frame}"):
             return Grid(self.grids[name], labels, counts)
-        except FormatError as error:
-            raise error.within(f"{self.location}: frame {frame}") from error
 
     def __iter__(self) -> Iterator[int]:
         return iter(self.scan_frames().tolist())

@@ -161,7 +161,7 @@ class HDF5FieldWriter(FieldWriter):
 
     def _plan(self, arrays: list[AnyArray]) -> None:
         writer = self._writer
-        typical = typical_size(self.entry, arrays, writer.rows, writer.read_document)
+        typical = typical_size(self.entry, arrays, writer.rows, writer.cells_of)
         self.layout = FieldLayout.plan(self.entry.name, writer.options, typical)
         self._planned = True
 
@@ -197,14 +197,14 @@ class HDF5ColumnWriter:
     def _flush(self) -> None:
         if not self._held:
             return
-        encoded = in_threads(lambda one: self._encoding.encode(one[2], "hdf5"), self._held)
+        encoded = in_threads(lambda one: self._encoding.encode(one[2]), self._held)
         step, shape = self._dataset.chunks[-1], self._dataset.shape
         needed = (max(number for _, number, _ in self._held) + 1) * step
         self._dataset.resize((self._held[-1][0] + 1, *shape[1:-1], max(shape[-1], needed)))
         for (frame, number, _), data in zip(self._held, encoded, strict=True):
             offset = (frame, *[0] * (len(shape) - 2), number * step)
             self._dataset.id.write_direct_chunk(offset, data)
-            self._checksums.append(crc32c(data, "hdf5"))
+            self._checksums.append(crc32c(data))
         self._held = []
         self._output.check()
 

@@ -8,7 +8,6 @@ block of frames can therefore be written independently of the others, and found 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from typing import Any
@@ -16,10 +15,9 @@ from typing import Any
 import numpy as np
 
 from carlasc.core.arrays import AnyArray, IntArray
-from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
 from carlasc.storage import field_files, layout
-from carlasc.storage.files import damaged, parse_json
+from carlasc.storage.files import damaged
 from carlasc.storage.packed.chunks import StoredArray
 from carlasc.storage.packed.columns import FEW, LEAST, Column, Packing, packing_of
 from carlasc.storage.packed.stores import VERSION, PackOptions
@@ -246,7 +244,7 @@ def typical_size(
     entry: field_files.Field,
     arrays: list[AnyArray],
     rows: Mapping[str, int],
-    read_document: Callable[[str], bytes | None],
+    cells_of: Callable[[str], int | None],
 ) -> tuple[int, ...]:
     """Return the typical size of a new field, for `FieldLayout.plan`.
 
@@ -254,7 +252,7 @@ def typical_size(
         entry: the field.
         arrays: the first frames.
         rows: the announced number of elements of a typical frame, by field.
-        read_document: returns a text file of the sequence, None if it does not exist.
+        cells_of: returns the number of voxels of a grid, None if it is not known.
 
     Returns:
         The shape of a grid, or (number of elements of a typical frame,): as announced, otherwise
@@ -265,7 +263,7 @@ def typical_size(
     announced = rows.get("points") if entry.per == "point" else None
     announced = rows.get(entry.name) if announced is None else announced
     if announced is None and entry.per in _CELLS_PER_ROW:
-        announced = _cells(entry.folder, read_document) // _CELLS_PER_ROW[entry.per]
+        announced = (cells_of(entry.folder) or 0) // _CELLS_PER_ROW[entry.per]
     if announced is None:
         announced = max(map(len, arrays), default=0)
         announced = (
@@ -274,19 +272,6 @@ def typical_size(
             else announced
         )
     return (announced,)
-
-
-def _cells(grid: str, read_document: Callable[[str], bytes | None]) -> int:
-    """Return the number of voxels of a grid; 0 if it is not known."""
-    data = read_document(layout.params_file(grid))
-    try:
-        return (
-            0
-            if data is None
-            else math.prod(GridSpec.from_params(parse_json(data, grid), grid).size)
-        )
-    except FormatError:
-        return 0
 
 
 def count_elements(

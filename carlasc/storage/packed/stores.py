@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,10 +87,20 @@ class PackedSource(Source):
         """Return the size of the published files by field; empty if it is not recorded."""
         return {}
 
-    @abstractmethod
     def stored_bytes(self) -> dict[str, int]:
         """Return the stored bytes by field, with "documents" for the text files and "index" for
         everything else.
+        """
+        sizes: Counter[str] = Counter()
+        for path, sequence in self.sequences().items():
+            for name in ("documents", *sequence.fields()):
+                sizes[name] += self._stored_bytes(self.nodes[path], name)
+        return dict(sizes) | {"index": self._stored_bytes("", "") - sizes.total()}
+
+    @abstractmethod
+    def _stored_bytes(self, group: str, name: str) -> int:
+        """Return the stored bytes of a field, or of the "documents", of a sequence, or of the whole
+        store if both are empty.
         """
 
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from carlasc.core.arrays import AnyArray
 from carlasc.core.grids import Coordinates
-from carlasc.errors import FormatError, import_extra
+from carlasc.errors import import_extra, within
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
 from carlasc.storage.layout import identity_of
@@ -24,7 +24,7 @@ from carlasc.storage.transport.targets import LocalTarget, Target
 from carlasc.storage.zarr.block_tables import EncodedFrame, StoredField, encode_frame
 from carlasc.storage.zarr.root import StoreRoot, existing_options
 from carlasc.storage.zarr.shards import METADATA, group_metadata
-from carlasc.storage.zarr.zarr_finish import EXPECTED, finish, format_expected, parse_expected
+from carlasc.storage.zarr.zarr_finish import EXPECTED, finish, format_expected, read_expected
 from carlasc.storage.zarr.zarr_source import ZarrSource
 
 _PUTS = 16  # objects that are written in parallel
@@ -132,16 +132,14 @@ class ZarrWriter(SequenceWriter):
     ) -> None:
         """Record the announced frames, so that the store is not finished without them."""
         self._rows.update(rows or {})
-        path = f"{self.group}/{EXPECTED}"
-        there = self.target.read(path)
-        known = {} if there is None else parse_expected(there, self.target.tree.where(path))
+        known = read_expected(self.target, self.group)
         merged = known | {
             name: known.get(name, set()) | set(map(int, numbers))
             for name, numbers in frames.items()
         }
         if merged != known:
             self._start()
-            self.target.put(path, format_expected(merged))
+            self.target.put(f"{self.group}/{EXPECTED}", format_expected(merged))
 
     def has(self, field: str, frame: int) -> bool:
         """Whether this or another process has written the frame."""
@@ -218,6 +216,10 @@ class ZarrWriter(SequenceWriter):
         self._start()
         self._flush()
 
+    def _within(self, field: str, frame: int) -> AbstractContextManager[None]:
+        """Add the store, the field and the frame to the place of an error."""
+        return within(f"{self.location}: field {field}, frame {frame}")
+
     def _start(self) -> None:
         """Create the store and the sequence, before the first write."""
         if not self._begun:
@@ -254,21 +256,19 @@ class ZarrWriter(SequenceWriter):
         ]
         arrays: dict[str, list[AnyArray]] = {}
         for name, frame, array in items:
-            with _naming(self.location, name, frame):
+            with self._within(name, frame):
                 layout.field_named(name).check(array, "its array")
             arrays.setdefault(name, []).append(array)
         layouts = {
             name: self._field(name).create(
-                partial(
-                    typical_size, layout.field_named(name), found, self._rows, self.read_document
-                )
+                partial(typical_size, layout.field_named(name), found, self._rows, self.cells_of)
             )
             for name, found in arrays.items()
         }
 
         def encode(item: tuple[str, int, AnyArray]) -> EncodedFrame:
             name, frame, array = item
-            with _naming(self.location, name, frame):
+            with self._within(name, frame):
                 return encode_frame(layouts[name], array)
 
         result: dict[str, dict[int, EncodedFrame]] = {}
@@ -308,12 +308,3 @@ class ZarrWriter(SequenceWriter):
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_held": {}, "_fields": {}, "_keeps": False}
-
-
-@contextmanager
-def _naming(location: str, field: str, frame: int) -> Iterator[None]:
-    """Add the store, the field and the frame to the place of an error."""
-    try:
-        yield
-    except FormatError as error:
-        raise error.within(f"{location}: field {field}, frame {frame}") from error
