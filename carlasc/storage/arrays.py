@@ -13,7 +13,7 @@ import math
 import os
 import zipfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -22,6 +22,7 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray
 from carlasc.errors import FormatError, MissingDataError, reading
+from carlasc.storage.files import damaged
 
 # bytes: smaller arrays are unpacked at any compression ratio: zeros compress very well
 _SMALL = 1 << 26  # fact: small-array
@@ -111,11 +112,11 @@ def check_ratio(size: int, packed: int, where: str) -> None:
         FormatError: the array is large, and its ratio is higher than that of any real array.
     """
     if size > max(_SMALL, _MOST_RATIO * packed):
-        raise FormatError(
+        raise damaged(
             where,
-            expected=f"at most {_MOST_RATIO} times the {packed} packed bytes",
-            found=f"{size} unpacked bytes",
-            advice="the file was made to fill the memory: do not use it",
+            f"at most {_MOST_RATIO} times the {packed} packed bytes",
+            f"{size} unpacked bytes",
+            "the file was made to fill the memory: do not use it",
         )
 
 
@@ -128,11 +129,11 @@ def check_size(shape: tuple[int, ...], dtype: np.dtype[Any], what: str) -> None:
         FormatError: the array is too large; the message begins with `what`.
     """
     if math.prod(shape) * dtype.itemsize > _MOST_BYTES:
-        raise FormatError(
+        raise damaged(
             what,
-            expected=f"at most {_MOST_BYTES} bytes",
-            found=f"{dtype.name} of shape {_text(shape)}",
-            advice="the store is damaged, or was made to fill the memory",
+            f"at most {_MOST_BYTES} bytes",
+            f"{dtype.name} of shape {_text(shape)}",
+            "the store is damaged, or was made to fill the memory",
         )
 
 
@@ -212,20 +213,14 @@ def open_npz(source: str | Path | bytes | memoryview, where: str = "") -> Iterat
         MissingDataError: the file does not exist.
         FormatError: the file is not a zip, is damaged, or cannot be read.
     """
-    if isinstance(source, bytes | memoryview):
-        with _archive(io.BytesIO(source), where) as archive:
-            yield archive
-    else:
-        with _opened(source) as file, _archive(file, where or str(source)) as archive:
-            yield archive
-
-
-@contextmanager
-def _archive(file: IO[bytes], where: str) -> Iterator[NpzFile]:
-    with reading(where, "an .npz file"):
-        archive = zipfile.ZipFile(file)
-        opened = NpzFile(archive, where)
-    with archive:
+    name = where or str(source)
+    with (
+        io.BytesIO(source) if isinstance(source, bytes | memoryview) else _opened(source) as file,
+        ExitStack() as stack,
+    ):
+        with reading(name, "an .npz file"):
+            archive = stack.enter_context(zipfile.ZipFile(file))
+            opened = NpzFile(archive, name)
         yield opened
 
 
@@ -301,11 +296,11 @@ def _check_header(
     if expected.most is not None and count > expected.most:
         raise FormatError(where, expected=f"at most {expected.most} values", found=_text(shape))
     if length != size:
-        raise FormatError(
+        raise damaged(
             where,
-            expected=f"{size} bytes ({_text(shape)} {dtype.name})",
-            found=str(length),
-            advice="the file is cut short, or something was added",
+            f"{size} bytes ({_text(shape)} {dtype.name})",
+            str(length),
+            "the file is cut short, or something was added",
         )
     return shape
 

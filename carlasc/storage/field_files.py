@@ -13,6 +13,7 @@ from carlasc.core.arrays import AnyArray, Float32Array
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError
 from carlasc.storage.arrays import ArrayFormat, npz_bytes, open_npz
+from carlasc.storage.files import damaged
 
 VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "u1"), ("votes", "<u2")])
 WIDE_VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "<u2"), ("votes", "<u2")])
@@ -116,20 +117,17 @@ class Field:
         dtype, size = np.dtype(self.dtype or BOXES_DTYPE), len(data)
         if shape is not None and size != self.size_of(shape):
             expected = f"{self.size_of(shape)} bytes ({' x '.join(map(str, shape))} {dtype.name})"
-            raise FormatError(
-                where,
-                expected=expected,
-                found=str(size),
-                advice="the file is cut short, or belongs to another grid",
+            raise damaged(
+                where, expected, str(size), "the file is cut short, or belongs to another grid"
             )
         columns = self.columns
         if size % (dtype.itemsize * (columns or 1)):
             row = f"{columns} {dtype.name} per row" if columns else f"one {self.per}"
-            raise FormatError(
+            raise damaged(
                 where,
-                expected=f"a multiple of {self.row_bytes} bytes ({row})",
-                found=str(size),
-                advice="the file may be cut short",
+                f"a multiple of {self.row_bytes} bytes ({row})",
+                str(size),
+                "the file may be cut short",
             )
         array = np.frombuffer(data, dtype)
         if shape is not None:

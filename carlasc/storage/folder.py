@@ -13,10 +13,10 @@ from typing import Any
 from carlasc.core.arrays import AnyArray
 from carlasc.errors import MissingDataError
 from carlasc.storage import field_files, layout
-from carlasc.storage.files import remove_stale
+from carlasc.storage.files import AnyPath, remove_stale
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.published import PublishedSequence, PublishedSource
-from carlasc.storage.sinks import SequenceWriter, Sink
+from carlasc.storage.sinks import FrameArrays, SequenceWriter, Sink
 from carlasc.storage.transport.targets import LocalTarget, Target, target_of
 from carlasc.storage.transport.trees import LocalTree
 
@@ -32,7 +32,7 @@ class FolderSource(PublishedSource):
     folder.
     """
 
-    def __init__(self, source: str | os.PathLike[str]) -> None:
+    def __init__(self, source: AnyPath) -> None:
         """Keep the path of the folder. It is listed when its sequences are first used.
 
         Raises:
@@ -80,7 +80,7 @@ class FolderSink(Sink):
 
     is_readable = True
 
-    def __init__(self, out: str | os.PathLike[str] | Target, **storage_options: Any) -> None:
+    def __init__(self, out: AnyPath | Target, **storage_options: Any) -> None:
         """Keep a folder, or its URL with options of fsspec. Nothing is written yet.
 
         Raises:
@@ -118,7 +118,7 @@ class FolderWriter(SequenceWriter):
 
     concurrent = True
 
-    def __init__(self, folder: str | os.PathLike[str] | Target) -> None:
+    def __init__(self, folder: AnyPath | Target) -> None:
         self.target = target_of(folder)
         self.location = self.target.location
         self._cells: dict[str, int] = {}  # voxels of each grid whose params.json has been read
@@ -177,7 +177,7 @@ class FolderWriter(SequenceWriter):
         """Write one file."""
         self.target.put(*self._file(field, frame, array))
 
-    def write_frames(self, frames: Mapping[int, Mapping[str, AnyArray]]) -> None:
+    def write_frames(self, frames: FrameArrays) -> None:
         """Write the files of several frames in parallel.
 
         The last file of each frame is written after the other files of that frame.

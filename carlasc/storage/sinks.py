@@ -19,6 +19,9 @@ from carlasc.storage import layout
 from carlasc.storage.files import parse_json
 from carlasc.storage.protocol import Source
 
+FrameArrays = Mapping[int, Mapping[str, AnyArray]]
+"""The fields of frames: arrays by field, by frame number."""
+
 
 class SequenceWriter(ABC):
     """Writes one sequence.
@@ -80,7 +83,7 @@ class SequenceWriter(ABC):
             FormatError: the array does not fit the field.
         """
 
-    def write_frames(self, frames: Mapping[int, Mapping[str, AnyArray]]) -> None:
+    def write_frames(self, frames: FrameArrays) -> None:
         """Write the fields of several frames, in the given order.
 
         `frames` maps frame numbers to fields by name, with the shapes of `write`.

@@ -416,7 +416,7 @@ def test_fewer_numbers_than_a_chunk_has_are_not_taken_for_all() -> None:
         with pytest.raises(
             FormatError, match=r"its bytes: cannot be decoded: \d+ elements instead of"
         ):
-            encoding.decode(data, np.empty(count, "<i4"), "zarr")
+            encoding.decode(data, np.empty(count, "<i4"))
 
 
 def test_an_hdf5_store_shows_no_other_file(hdf5_store: Path, tmp_path: Path) -> None:

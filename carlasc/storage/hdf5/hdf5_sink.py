@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,16 +11,15 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray
 from carlasc.errors import import_extra
-from carlasc.storage.files import sync_tree
+from carlasc.storage.files import AnyPath, sync_tree
 from carlasc.storage.hdf5.hdf5_source import CRC
 from carlasc.storage.packed.array_layout import (
     DOCUMENT,
     SEQUENCE,
     FieldLayout,
-    count_elements,
     document_node,
     field_node,
-    number_arrays,
+    index_arrays,
     typical_size,
 )
 from carlasc.storage.packed.chunks import crc32c, in_threads
@@ -44,7 +42,7 @@ class HDF5Sink(PackedSink):
 
     def __init__(
         self,
-        path: str | os.PathLike[str],
+        path: AnyPath,
         options: PackOptions | None = None,
         overwrite: bool = False,
     ) -> None:
@@ -106,18 +104,10 @@ class HDF5Writer(PackedWriter["HDF5FieldWriter"]):
             self._output.write_small(
                 f"{self.node}/{document_node(name)}", np.frombuffer(data, np.uint8), attributes
             )
-        frames, counts, columns = count_elements(
-            {name: field.layout for name, field in self.writers.items()},
-            {name: field.frames for name, field in self.writers.items()},
-        )
-        about = {"version": VERSION, "dtype": "int64"}
-        self._output.write_small(
-            f"{self.node}/frames", frames, about | {"type": "carlasc.frames", "unit": "frame"}
-        )
-        about |= {"type": "carlasc.counts", "unit": "element", "columns": columns}
-        self._output.write_small(f"{self.node}/counts", counts, about)
-        for name, numbers, attributes in number_arrays(self.read_document):
-            self._output.write_small(f"{self.node}/{name}", numbers, attributes)
+        layouts = {name: field.layout for name, field in self.writers.items()}
+        tables = {name: field.frames for name, field in self.writers.items()}
+        for name, values, attributes in index_arrays(layouts, tables, self.read_document):
+            self._output.write_small(f"{self.node}/{name}", values, attributes)
         self._output.write_group(self.node, {"type": SEQUENCE, "version": VERSION, **self.about()})
 
 

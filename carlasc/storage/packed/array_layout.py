@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from carlasc.core.arrays import AnyArray, IntArray
+from carlasc.core.arrays import AnyArray
 from carlasc.errors import FormatError
 from carlasc.storage import field_files, layout
 from carlasc.storage.files import damaged
 from carlasc.storage.packed.chunks import StoredArray
 from carlasc.storage.packed.columns import FEW, LEAST, Column, Packing, packing_of
-from carlasc.storage.packed.stores import VERSION, PackOptions
+from carlasc.storage.packed.stores import VERSION, PackOptions, check_scale
 
 SEQUENCE, FIELD, COLUMN, DOCUMENT = (
     "carlasc.sequence",
@@ -70,9 +70,7 @@ class FieldLayout:
         """
         if attributes is None or attributes.get("type") != FIELD:
             raise damaged(where, "the field that the sequence lists", "none")
-        scale = attributes.get("scale_m")
-        if scale is not None and not (type(scale) in (int, float) and 0 < scale <= 1):
-            raise damaged(where, "a step of coordinates above 0, up to 1 m", repr(scale))
+        check_scale(attributes, where)
         options = PackOptions(small=attributes.get("codec") == _PCODEC)
         packing = packing_of(layout.field_named(field), options, attributes)
         if attributes.get("kind") != packing.kind:
@@ -104,8 +102,11 @@ class FieldLayout:
             size: dict[str, Any] = {"shape": list(typical)}
         else:
             size = {"chunk": max(_round_up(int(typical[0] * _HEADROOM)), LEAST)}
-        about = {"type": FIELD, "version": VERSION, "field": entry.name, "kind": packing.kind}
-        about |= {
+        about = {
+            "type": FIELD,
+            "version": VERSION,
+            "field": entry.name,
+            "kind": packing.kind,
             "dtype": np.dtype(entry.dtype).name if entry.dtype else "table",
             "unit": entry.unit,
         }
@@ -274,18 +275,21 @@ def typical_size(
     return (announced,)
 
 
-def count_elements(
-    layouts: Mapping[str, FieldLayout], tables: Mapping[str, FrameTable]
-) -> tuple[IntArray, IntArray, list[str]]:
-    """Return the arrays `frames` and `counts` of a sequence, which readers use to find frames.
+def index_arrays(
+    layouts: Mapping[str, FieldLayout],
+    tables: Mapping[str, FrameTable],
+    read_document: Callable[[str], bytes | None],
+) -> Iterator[tuple[str, AnyArray, dict[str, Any]]]:
+    """Yield the arrays of a sequence beside its fields: name, values and attributes.
+
+    `frames` has the (N,) sorted frame numbers. `counts` has the (N, C) number of elements per frame
+    and column, -1 if the field lacks the frame, and the nodes of the C columns; readers find frames
+    by it. `poses` and `times` are for programs that do not read the text files.
 
     Args:
         layouts: the layout of each field.
-        tables: the frames of each field, at least one.
-
-    Returns:
-        frames: (N,) sorted frame numbers; counts: (N, C) number of elements per frame and column,
-        -1 if the field lacks the frame; and the nodes of the C columns.
+        tables: the frames of each field.
+        read_document: returns a text file of the sequence, None if it does not exist.
     """
     frames = sorted({frame for table in tables.values() for frame in table})
     columns: dict[str, list[int]] = {}
@@ -296,29 +300,19 @@ def count_elements(
             if max(counts) > 0 or column in firsts:
                 columns[f"{field_node(name)}/{column}"] = counts
     counts_of = np.array(list(columns.values()), "<i8").reshape(len(columns), len(frames)).T
-    return np.array(frames, "<i8"), np.ascontiguousarray(counts_of), list(columns)
-
-
-def number_arrays(
-    read_document: Callable[[str], bytes | None],
-) -> Iterator[tuple[str, AnyArray, dict[str, Any]]]:
-    """Yield poses and times as arrays, for programs that do not read the text files: name, values
-    and attributes.
-    """
+    about = {"version": VERSION, "dtype": "int64"}
+    yield "frames", np.array(frames, "<i8"), about | {"type": "carlasc.frames", "unit": "frame"}
+    about |= {"type": "carlasc.counts", "unit": "element", "columns": list(columns)}
+    yield "counts", np.ascontiguousarray(counts_of), about
     for name, document, decode, unit in (
         ("poses", layout.POSES, layout.decode_poses, "m"),
         ("times", layout.TIMES, layout.decode_times, "s"),
     ):
         data = read_document(document)
+        about = {"type": "carlasc.numbers", "version": VERSION, "dtype": "float64", "unit": unit}
         # not numbers: the text is kept unchanged, and its reader reports the error
         with suppress(FormatError):
             if data is not None:
-                about = {
-                    "type": "carlasc.numbers",
-                    "version": VERSION,
-                    "dtype": "float64",
-                    "unit": unit,
-                }
                 yield name, decode(data, document), about | {"document": document}
 
 

@@ -135,7 +135,7 @@ class ArraySequence(PackedSequence[ArrayField]):
 
     def read_document(self, name: str) -> bytes:
         """Return a text file's bytes."""
-        self._check_document(name)
+        self._check_listed("text file", self._documents, name)
         return self.store.read_document(f"{self.group}/{document_node(name)}")
 
     def files_of(self, field: str, frames: Iterable[int]) -> list[str]:

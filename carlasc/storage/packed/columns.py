@@ -17,6 +17,7 @@ from carlasc.core.arrays import AnyArray, Float32Array, Int32Array
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError
 from carlasc.storage import field_files
+from carlasc.storage.files import damaged
 from carlasc.storage.packed.chunks import BITSHUFFLE, NO_SHUFFLE, SHUFFLE, Encoding
 from carlasc.storage.packed.stores import PackOptions
 
@@ -34,6 +35,7 @@ _WIDE_CELLS = {
     "<u4": ("u1", "<u4"),
     "<f4": ("<u2", "<f4"),
 }
+_SHUFFLED = Encoding(shuffle=SHUFFLE)  # of nearly all columns
 Columns = dict[str, AnyArray]
 
 
@@ -133,7 +135,7 @@ class PointsPacking(Packing):
     kind = "points"
 
     def _columns(self, options: PackOptions) -> tuple[Column, ...]:
-        encoding = Encoding("pcodec", 8) if options.small else Encoding(shuffle=SHUFFLE)
+        encoding = Encoding("pcodec", 8) if options.small else _SHUFFLED
         scale = self.attributes.get("scale_m")
         dtype, unit = ("<i4", f"{scale} m") if scale else ("<f4", "m")
         return (
@@ -189,7 +191,7 @@ class ValuesPacking(Packing):
 
     def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         incompressible = self.entry.kind == "picture"
-        encoding = Encoding(level=1) if incompressible else Encoding(shuffle=SHUFFLE)
+        encoding = Encoding(level=1) if incompressible else _SHUFFLED
         dtype, wide = ("u1", "<u4") if self.entry.kind == "class" else (self.entry.dtype, None)
         return (Column("values", dtype, encoding, self.entry.unit, wide=wide),)
 
@@ -216,11 +218,7 @@ class PairsPacking(Packing):
 
     def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         rows = self.entry.columns
-        return (
-            Column(
-                "values", self.entry.dtype, Encoding(shuffle=SHUFFLE), self.entry.unit, rows=rows
-            ),
-        )
+        return (Column("values", self.entry.dtype, _SHUFFLED, self.entry.unit, rows=rows),)
 
     def split(self, array: AnyArray) -> Columns:
         """Return the columns as planes."""
@@ -239,9 +237,8 @@ class FlowPacking(Packing):
     kind = "flow"
 
     def _columns(self, options: PackOptions) -> tuple[Column, ...]:
-        encoding = Encoding(shuffle=SHUFFLE)
-        return Column("index", "u1", encoding, wide="<u4"), Column(
-            "palette", "<f4", encoding, self.entry.unit, rows=3, least=FEW, wide="<f4"
+        return Column("index", "u1", _SHUFFLED, wide="<u4"), Column(
+            "palette", "<f4", _SHUFFLED, self.entry.unit, rows=3, least=FEW, wide="<f4"
         )
 
     def split(self, array: AnyArray) -> Columns:
@@ -260,13 +257,7 @@ class FlowPacking(Packing):
         """Return (N, 3) float32."""
         index, palette = columns["index"], columns["palette"]
         if index.size and int(index.max()) >= palette.shape[1]:
-            found, advice = str(int(index.max())), "the store is damaged"
-            raise FormatError(
-                "its index",
-                expected=f"indices below {palette.shape[1]}",
-                found=found,
-                advice=advice,
-            )
+            raise damaged("its index", f"indices below {palette.shape[1]}", str(int(index.max())))
         return np.ascontiguousarray(palette.T)[index]
 
 
@@ -335,9 +326,9 @@ class VotesPacking(TablePacking):
 
     def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         return (
-            Column("voxel", "<i4", Encoding(shuffle=SHUFFLE), "index"),
+            Column("voxel", "<i4", _SHUFFLED, "index"),
             Column("label", "u1", Encoding(), "class", wide="<u2"),
-            Column("votes", "<u2", Encoding(shuffle=SHUFFLE), self.entry.unit),
+            Column("votes", "<u2", _SHUFFLED, self.entry.unit),
         )
 
 
@@ -348,9 +339,8 @@ class VelocitiesPacking(TablePacking):
     tables = field_files.TABLES["velocities"]
 
     def _columns(self, options: PackOptions) -> tuple[Column, ...]:
-        encoding = Encoding(shuffle=SHUFFLE)
-        return Column("voxel", "<i4", encoding, "index"), Column(
-            "velocity", "<f2", encoding, self.entry.unit, rows=3
+        return Column("voxel", "<i4", _SHUFFLED, "index"), Column(
+            "velocity", "<f2", _SHUFFLED, self.entry.unit, rows=3
         )
 
 
@@ -361,19 +351,18 @@ class BoxesPacking(TablePacking):
     tables = (_STORED_BOX,)
 
     def _columns(self, options: PackOptions) -> tuple[Column, ...]:
-        encoding = Encoding(shuffle=SHUFFLE)
         return (
             Column(
                 "geometry",
                 "<f8",
-                encoding,
+                _SHUFFLED,
                 self.entry.unit,
                 rows=_STORED_BOX["geometry"].shape[0],
                 least=FEW,
             ),
-            Column("track", "<u4", encoding, "object", least=FEW),
-            Column("label", "<u4", encoding, "class", least=FEW),
-            Column("annotated", "u1", encoding, least=FEW),
+            Column("track", "<u4", _SHUFFLED, "object", least=FEW),
+            Column("label", "<u4", _SHUFFLED, "class", least=FEW),
+            Column("annotated", "u1", _SHUFFLED, least=FEW),
         )
 
     def split(self, array: AnyArray) -> Columns:

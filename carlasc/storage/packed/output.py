@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 from carlasc.errors import ArgumentError, ConflictError, FormatError, StorageError
 from carlasc.storage.files import (
+    AnyPath,
     make_folder,
     remove_file,
     rename,
@@ -64,7 +65,7 @@ def _is_store(path: Path) -> bool:
         return file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE
 
 
-def unfinished_error(where: str | os.PathLike[str]) -> FormatError:
+def unfinished_error(where: AnyPath) -> FormatError:
     """Return the error for an unfinished store of any format: it is being written, or the run was
     interrupted.
     """

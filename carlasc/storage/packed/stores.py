@@ -4,10 +4,9 @@ sequence.
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar, cast
@@ -18,7 +17,7 @@ from carlasc.core.arrays import AnyArray, IntArray
 from carlasc.core.grids import Coordinates
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, within
 from carlasc.storage import layout
-from carlasc.storage.files import damaged, leads_outside, unfinished
+from carlasc.storage.files import AnyPath, damaged, leads_outside, unfinished
 from carlasc.storage.layout import identity_of
 from carlasc.storage.packed.output import refuse_existing, unfinished_error
 from carlasc.storage.protocol import Sequence, Source
@@ -188,21 +187,16 @@ class PackedSequence(Sequence, Generic[_FieldReader]):
         """Return the names of the text files."""
         return tuple(name for name in self._documents if not name.startswith(f"{layout.DERIVED}/"))
 
-    def _check_document(self, name: str) -> None:
-        if name not in self._documents:
+    def _check_listed(self, what: str, names: Collection[str], name: str) -> None:
+        if name not in names:
             raise MissingDataError(
                 self.location,
-                expected=f"the text file {name}",
-                found=", ".join(self._documents) or "none",
+                expected=f"the {what} {name}",
+                found=", ".join(sorted(names)) or "none",
             )
 
     def _field(self, field: str) -> _FieldReader:
-        if field not in self._fields:
-            raise MissingDataError(
-                self.location,
-                expected=f"the field {field}",
-                found=", ".join(sorted(self._fields)) or "none",
-            )
+        self._check_listed("field", self._fields, field)
         if field not in self._readers:
             self._readers[field] = self._open_field(field)
         return self._readers[field]
@@ -224,9 +218,7 @@ class PackedSink(Sink):
         nodes: the group (or folder) of each completed sequence.
     """
 
-    def __init__(
-        self, path: str | os.PathLike[str], options: PackOptions | None, overwrite: bool
-    ) -> None:
+    def __init__(self, path: AnyPath, options: PackOptions | None, overwrite: bool) -> None:
         """Check the options and the path. Nothing is written yet.
 
         Raises:
@@ -369,6 +361,17 @@ class PackedWriter(SequenceWriter, Generic[_FieldWriter]):
         split, name, coordinates = self.identity
         about = {"path": self.path, "split": split, "name": name, "coordinates": coordinates}
         return about | {"fields": sorted(self.writers), "documents": sorted(self.contents)}
+
+
+def check_scale(attributes: Mapping[str, Any], where: str) -> None:
+    """Check the size of a step of quantised coordinates in the attributes of a field.
+
+    Raises:
+        FormatError: it is not a length of at most 1 m.
+    """
+    scale = attributes.get("scale_m", 1)
+    if type(scale) not in (int, float) or not 0 < scale <= 1:
+        raise damaged(where, "a step of coordinates above 0, up to 1 m", repr(scale))
 
 
 def node_of(path: str, where: str) -> str:

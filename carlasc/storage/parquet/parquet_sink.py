@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from carlasc.core.arrays import AnyArray
 from carlasc.errors import FormatError, import_extra
 from carlasc.storage import layout
 from carlasc.storage.files import (
+    AnyPath,
     parse_json,
     remove_file,
     remove_stale,
@@ -61,7 +61,7 @@ class ParquetSink(PackedSink):
 
     def __init__(
         self,
-        path: str | os.PathLike[str],
+        path: AnyPath,
         options: PackOptions | None = None,
         overwrite: bool = False,
     ) -> None:

@@ -22,7 +22,7 @@ from carlasc.storage import layout
 from carlasc.storage.arrays import check_ratio, check_size
 from carlasc.storage.files import damaged, parse_json
 from carlasc.storage.packed.output import TABLES_MARK
-from carlasc.storage.packed.stores import PackedSequence, PackedSource
+from carlasc.storage.packed.stores import PackedSequence, PackedSource, check_scale
 from carlasc.storage.parquet.table_columns import column_types, join_columns
 from carlasc.storage.protocol import Sequence
 from carlasc.storage.transport.remote_tree import RemoteTree
@@ -93,7 +93,7 @@ class ParquetSequence(PackedSequence["FieldTable"]):
 
     def read_document(self, name: str) -> bytes:
         """Return a text file's bytes."""
-        self._check_document(name)
+        self._check_listed("text file", self._documents, name)
         path = f"{self.folder}/{DOCUMENTS}"
         self._check_footer(DOCUMENTS)
         with opened(self.tree, path) as file:
@@ -232,15 +232,10 @@ def check_attributes(about: Any, where: str) -> Mapping[str, Any]:
         FormatError: they are missing, the step of coordinates is not a valid length, or labels do
             not have one or two bytes.
     """
-    scale, label_bytes = about.get("scale_m"), about.get("label_bytes", 1)
-    if (
-        "scale_m" in about and not (type(scale) in (int, float) and 0 < scale <= 1)
-    ) or label_bytes not in (1, 2):
-        raise damaged(
-            where,
-            "a step of coordinates up to 1 m, and labels of 1 or 2 bytes",
-            f"{scale!r} and {label_bytes!r}",
-        )
+    check_scale(about, where)
+    label_bytes = about.get("label_bytes", 1)
+    if label_bytes not in (1, 2):
+        raise damaged(where, "labels of 1 or 2 bytes", repr(label_bytes))
     return {**about, "label_bytes": label_bytes}
 
 
@@ -253,11 +248,8 @@ def footer_checksum(tree: Tree, path: str) -> int:
     """
     end = bytes(tree.read_range(path, -_END, 0))
     if len(end) != _END or not end.endswith(_MARK):
-        raise FormatError(
-            tree.where(path),
-            expected="a Parquet file",
-            found="another end of the file",
-            advice="it may be truncated",
+        raise damaged(
+            tree.where(path), "a Parquet file", "another end of the file", "it may be truncated"
         )
     length = int.from_bytes(end[:4], "little")
     if length > _LONGEST:

@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import FormatError
-from carlasc.storage.files import parse_json, to_json
+from carlasc.storage.files import damaged, parse_json, to_json
 from carlasc.storage.packed.array_fields import ArrayField
 from carlasc.storage.packed.array_layout import FieldLayout, FrameTable
 from carlasc.storage.packed.stores import PackOptions
@@ -114,9 +113,7 @@ class StoredField:
 
     def _known_layout(self) -> FieldLayout:
         if (field_layout := self.layout()) is None:
-            raise FormatError(
-                self.where, expected="the field", found="none", advice="another program removed it"
-            )
+            raise damaged(self.where, "the field", "none", "another program removed it")
         return field_layout
 
     def has(self, frame: int) -> bool:
@@ -313,7 +310,5 @@ def parse_table(data: bytes, where: str) -> FrameTable:
             for frame, counts in frames.items()
         }
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise FormatError(
-            where, expected="the frames of a block", found="something else",
-            advice="remove this file and run the same command again",
-        ) from error  # fmt: skip
+        advice = "remove this file and run the same command again"
+        raise damaged(where, "the frames of a block", "something else", advice) from error

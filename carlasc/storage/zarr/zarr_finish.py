@@ -7,7 +7,6 @@ can be interrupted and repeated.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,17 +14,16 @@ from typing import Any
 import numpy as np
 
 from carlasc.core.arrays import AnyArray
-from carlasc.errors import ConflictError, FormatError, MissingDataError
-from carlasc.storage.files import damaged, parse_json, remove_stale, to_json
+from carlasc.errors import ConflictError, MissingDataError
+from carlasc.storage.files import AnyPath, damaged, parse_json, remove_stale, to_json
 from carlasc.storage.packed.array_layout import (
     FIELD,
     SEQUENCE,
     FieldLayout,
     FrameTable,
-    count_elements,
     document_node,
     field_node,
-    number_arrays,
+    index_arrays,
 )
 from carlasc.storage.packed.chunks import SHUFFLE, Encoding, in_threads
 from carlasc.storage.packed.stores import STORE, VERSION, check_names
@@ -80,23 +78,19 @@ class StoreNodes:
         tables: Mapping[str, FrameTable],
         block: int,
     ) -> None:
-        """Add the fields of a sequence: groups, columns, and the tables of their frames."""
-        frames, counts, columns = count_elements(fields, tables)
+        """Add the groups of the fields of a sequence, and the columns that frames use."""
         for name, found in fields.items():
-            self.group(f"{node}/{field_node(name)}", found.attributes)
-        for path, most in zip(columns, counts.max(axis=0, initial=0).tolist(), strict=True):
-            name = path.partition("/")[2].rpartition("/")[0]
-            if most > 0:
-                room = -(-(max(tables[name]) + 1) // block) * block
-                column = fields[name].columns[path.rpartition("/")[2]]
-                self.metadata[f"{node}/{path}"] = column_metadata(fields[name], column, block, room)
-        self.small(f"{node}/frames", frames, {"type": "carlasc.frames", "unit": "frame"})
-        about = {"type": "carlasc.counts", "unit": "element", "columns": columns}
-        self.small(f"{node}/counts", counts, about)
+            group, table = f"{node}/{field_node(name)}", tables[name]
+            self.group(group, found.attributes)
+            room = -(-(max(table) + 1) // block) * block
+            for column in found.columns.values():
+                if any(counts.get(column.name) for counts in table.values()):
+                    metadata = column_metadata(found, column, block, room)
+                    self.metadata[f"{group}/{column.name}"] = metadata
 
     def small(self, node: str, values: AnyArray, attributes: Mapping[str, Any]) -> None:
         """Add an array of one chunk."""
-        about = {"version": VERSION, "dtype": values.dtype.name, **attributes}
+        about = {"version": VERSION, "dtype": values.dtype.name, **attributes}  # in this order
         chunk = tuple(max(1, n) for n in values.shape)
         self.metadata[node] = array_metadata(values.dtype, values.shape, chunk, _SMALL, about)
         if values.size:
@@ -105,7 +99,7 @@ class StoreNodes:
 
 
 def finish(
-    out: str | os.PathLike[str] | Target, *, incomplete: bool = False, **storage_options: Any
+    out: AnyPath | Target, *, incomplete: bool = False, **storage_options: Any
 ) -> FinishedStore:
     """Write the metadata of a zarr store, so that it can be opened.
 
@@ -127,7 +121,7 @@ def finish(
     """
     target = target_of(out, **storage_options)
     if isinstance(target, LocalTarget):
-        remove_stale(target.folder, deep=True)
+        remove_stale(target.folder)
     paths = sorted(target.paths())
     while True:
         result = _write_metadata(target, paths, incomplete)
@@ -185,8 +179,8 @@ def _write_metadata(target: Target, paths: list[str], incomplete: bool) -> Finis
         def read_document(name: str, node: str = node) -> bytes | None:
             return target.read(f"{node}/{document_node(name)}")
 
-        for name, numbers, about in number_arrays(read_document):
-            nodes.small(f"{node}/{name}", numbers, about)
+        for name, values, about in index_arrays(fields, frames, read_document):
+            nodes.small(f"{node}/{name}", values, about)
     check_names([*sequences, *sequences.values()], target.location)
     if result.missing and not incomplete:
         raise _missing(result)
@@ -241,11 +235,8 @@ def read_expected(target: Target, node: str) -> dict[str, set[int]]:
             for name, ranges in ({} if data is None else parse_json(data, where)).items()
         }
     except (TypeError, ValueError) as error:
-        raise FormatError(
-            where,
-            expected="ranges of frames",
-            found="something else",
-            advice="remove this file and run again",
+        raise damaged(
+            where, "ranges of frames", "something else", "remove this file and run again"
         ) from error
 
 

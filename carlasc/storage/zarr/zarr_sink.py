@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
@@ -14,12 +13,12 @@ from carlasc.core.arrays import AnyArray
 from carlasc.core.grids import Coordinates
 from carlasc.errors import import_extra, within
 from carlasc.storage import layout
-from carlasc.storage.files import to_json
+from carlasc.storage.files import AnyPath, to_json
 from carlasc.storage.layout import identity_of
 from carlasc.storage.packed.array_layout import SEQUENCE, document_node, field_node, typical_size
 from carlasc.storage.packed.chunks import in_threads
 from carlasc.storage.packed.stores import VERSION, PackOptions, check_names, node_of
-from carlasc.storage.sinks import SequenceWriter, Sink
+from carlasc.storage.sinks import FrameArrays, SequenceWriter, Sink
 from carlasc.storage.transport.targets import LocalTarget, Target
 from carlasc.storage.zarr.block_tables import EncodedFrame, StoredField, encode_frame
 from carlasc.storage.zarr.root import StoreRoot, existing_options
@@ -42,7 +41,7 @@ class ZarrSink(Sink):
 
     def __init__(
         self,
-        out: str | os.PathLike[str] | Target,
+        out: AnyPath | Target,
         options: PackOptions | None = None,
         overwrite: bool = False,
     ) -> None:
@@ -100,9 +99,7 @@ class ZarrSink(Sink):
 class ZarrWriter(SequenceWriter):
     """Writes one sequence of a zarr store.
 
-    `write_frames` writes blocks of frames at once. `write` keeps the frames of a block in memory
-    until the first frame of another block, or until the writer is closed. In a pickled copy, which
-    is never closed, it writes each frame immediately.
+    `write_frames` writes blocks of frames at once, and is several times as fast as `write`.
 
     Attributes:
         identity: split, name and coordinates; by default those of the path.
@@ -123,9 +120,7 @@ class ZarrWriter(SequenceWriter):
         self._rows: dict[str, int] = {}
         self._root = root
         self._begun = False
-        self._keeps = True
         self._fields: dict[str, StoredField] = {}
-        self._held: dict[str, dict[int, EncodedFrame]] = {}  # frames of one block, by field
 
     def expect(
         self, frames: Mapping[str, Iterable[int]], rows: Mapping[str, int] | None = None
@@ -144,7 +139,7 @@ class ZarrWriter(SequenceWriter):
     def has(self, field: str, frame: int) -> bool:
         """Whether this or another process has written the frame."""
         layout.field_named(field)
-        return frame in self._held.get(field, {}) or self._field(field).has(frame)
+        return self._field(field).has(frame)
 
     def refresh(self) -> None:
         """Discard the cached lists of missing frames."""
@@ -153,72 +148,57 @@ class ZarrWriter(SequenceWriter):
 
     def read(self, field: str, frame: int) -> AnyArray | None:
         """Return an existing frame; None if it does not exist."""
-        if frame in self._held.get(field, {}):
-            self._flush()
         return self._field(field).read(frame)
 
     def write(self, field: str, frame: int, array: AnyArray) -> None:
-        """Write one frame. It is stored together with the other frames of its block."""
-        encoded = self._encode({frame: {field: array}})
-        if not self._keeps:
-            self._put(frame // self.block, encoded)
-            return
-        if any(
-            other // self.block != frame // self.block
-            for frames in self._held.values()
-            for other in frames
-        ):
-            self._flush()
-        self._held.setdefault(field, {}).update(encoded[field])
+        """Write one frame. The objects of its block are written again."""
+        self.write_frames({frame: {field: array}})
 
-    def write_frames(self, frames: Mapping[int, Mapping[str, AnyArray]]) -> None:
+    def write_frames(self, frames: FrameArrays) -> None:
         """Write the fields of several frames, block by block."""
-        self._flush()
         for block in sorted({frame // self.block for frame in frames}):
-            self._put(
-                block,
-                self._encode(
-                    {frame: frames[frame] for frame in frames if frame // self.block == block}
-                ),
-            )
+            ours = {frame: frames[frame] for frame in frames if frame // self.block == block}
+            self._put(block, self._encode(ours))
 
     def write_document(self, name: str, data: bytes) -> None:
         """Write a text file."""
-        check_names([name], self.location)
+        path = self._document(name)
         self._start()
-        self.target.put(f"{self.group}/{document_node(name)}", data)
+        self.target.put(path, data)
 
     def create_document(self, name: str, data: bytes) -> bool:
         """Write a text file unless it exists."""
-        check_names([name], self.location)
+        path = self._document(name)
         self._start()
-        return self.target.put(f"{self.group}/{document_node(name)}", data, create=True)
+        return self.target.put(path, data, create=True)
 
     def read_document(self, name: str) -> bytes | None:
         """Return the bytes of a text file, None if it does not exist."""
-        check_names([name], self.location)
-        return self.target.read(f"{self.group}/{document_node(name)}")
+        return self.target.read(self._document(name))
 
     def remove_grid(self, grid: str) -> None:
         """Remove the report and the frames of a grid, then its params.json."""
         check_names([grid], self.location)
         self._start()
-        self._flush()
-        self.target.remove(f"{self.group}/{document_node(layout.report_file(grid))}")
+        self.target.remove(self._document(layout.report_file(grid)))
         self.target.remove(f"{self.group}/grids/{grid}")
-        self.target.remove(f"{self.group}/{document_node(layout.params_file(grid))}")
+        self.target.remove(self._document(layout.params_file(grid)))
         self._fields = {
             name: field for name, field in self._fields.items() if not name.startswith(f"{grid}/")
         }
 
     def close(self) -> None:
-        """Write the frames that are kept in memory."""
+        """Create the sequence, if nothing was written to it."""
         self._start()
-        self._flush()
 
     def _within(self, field: str, frame: int) -> AbstractContextManager[None]:
         """Add the store, the field and the frame to the place of an error."""
         return within(f"{self.location}: field {field}, frame {frame}")
+
+    def _document(self, name: str) -> str:
+        """Return the path of a text file."""
+        check_names([name], self.location)
+        return f"{self.group}/{document_node(name)}"
 
     def _start(self) -> None:
         """Create the store and the sequence, before the first write."""
@@ -244,9 +224,7 @@ class ZarrWriter(SequenceWriter):
             )
         return self._fields[field]
 
-    def _encode(
-        self, frames: Mapping[int, Mapping[str, AnyArray]]
-    ) -> dict[str, dict[int, EncodedFrame]]:
+    def _encode(self, frames: FrameArrays) -> dict[str, dict[int, EncodedFrame]]:
         """Encode frames in threads, and create new fields."""
         self._start()
         items = [
@@ -301,10 +279,5 @@ class ZarrWriter(SequenceWriter):
         with ThreadPoolExecutor(_PUTS) as pool:
             list(pool.map(function, items))
 
-    def _flush(self) -> None:
-        held, self._held = self._held, {}
-        if held:
-            self._put(next(iter(next(iter(held.values())))) // self.block, held)
-
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_held": {}, "_fields": {}, "_keeps": False}
+        return self.__dict__ | {"_fields": {}}
