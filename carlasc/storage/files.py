@@ -100,7 +100,12 @@ def _written(files: Mapping[Path, Content]) -> Iterator[Mapping[Path, Path]]:
     path = Path()
     try:
         for path, content in files.items():
-            _write(temporaries[path], content)
+            make_folder(path.parent)
+            with temporaries[path].open("xb") as file:
+                if callable(content):
+                    content(file)
+                else:
+                    file.write(content)
         sync_all(temporaries.values())
         yield temporaries
     except OSError as error:
@@ -117,15 +122,6 @@ def _temporary(path: Path) -> Path:
     It is determined before the file is created, so that it is removed whenever a signal interrupts.
     """
     return path.with_name(f".{path.name}.{_HOST}-{os.getpid()}.{os.urandom(4).hex()}{_PART}")
-
-
-def _write(temporary: Path, content: Content) -> None:
-    make_folder(temporary.parent)
-    with temporary.open("xb") as file:
-        if callable(content):
-            content(file)
-        else:
-            file.write(content)
 
 
 def _remove(temporary: Path) -> None:

@@ -14,7 +14,7 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import ItemsView, Iterable, Iterator, Mapping, ValuesView
 from functools import cached_property
-from typing import Any, Self, cast
+from typing import Any, Protocol, Self, cast
 
 import numpy as np
 
@@ -31,7 +31,25 @@ from carlasc.errors import FormatError, MissingDataError, MissingKeyError, first
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json
 from carlasc.storage.metadata import Metadata
-from carlasc.storage.transport.trees import Tree
+
+
+class FileTree(Protocol):
+    """The part of a tree of files, local or remote, that this protocol uses.
+
+    Attributes:
+        location: its name in errors: a folder, a zip, a URL.
+    """
+
+    location: str
+
+    def read(self, path: str, size: int | None = None) -> bytes | memoryview:
+        """Return a file's bytes.
+
+        Args:
+            path: the file, its parts joined by "/".
+            size: expected size in bytes; None if it is not known.
+        """
+        ...
 
 
 class Sequence(ABC):
@@ -55,7 +73,7 @@ class Sequence(ABC):
     split: str | None
     name: str
     coordinates: Coordinates
-    tree: Tree | None = None
+    tree: FileTree | None = None
     _given_poses: FloatArray | None = None
 
     @abstractmethod
