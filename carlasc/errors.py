@@ -146,6 +146,15 @@ def reading(where: object, expected: str, advice: str = "") -> Iterator[None]:
         ) from error
 
 
+@contextmanager
+def within(where: object) -> Iterator[None]:
+    """Prefix the place of a FormatError in a block with the place that contains it."""
+    try:
+        yield
+    except FormatError as error:
+        raise error.within(where) from error
+
+
 def describe(error: BaseException) -> str:
     """Return the message of an error of another library, or its type if the message is not
     sufficient.

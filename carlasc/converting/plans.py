@@ -31,7 +31,7 @@ from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
 from carlasc.storage.metadata import Metadata
-from carlasc.storage.resuming import agree_metadata, agree_poses, agree_times, check_grid
+from carlasc.storage.resuming import agree_lines, agree_metadata, check_grid
 from carlasc.storage.sinks import SequenceWriter, Sink
 
 if TYPE_CHECKING:
@@ -343,7 +343,7 @@ def begin(plan: RecordingPlan, target: AxesAndClasses, metadata: Metadata) -> No
         )
     _announce(plan)
     documents = {layout.METADATA: agree_metadata(writer, replace(metadata, extra=extra))}
-    documents[layout.TIMES] = agree_times(writer, plan.times - plan.times[0])
+    documents[layout.TIMES] = agree_lines(writer, layout.TIMES, plan.times - plan.times[0])
     if plan.voxels is not None:
         documents[layout.params_file(layout.grid_folder(plan.voxels))] = to_json(
             _voxel_params(plan.voxels, target)
@@ -365,7 +365,7 @@ def write_poses(plan: RecordingPlan, target: AxesAndClasses) -> None:
     """
     assert plan.poses is not None
     poses = mirror_poses(plan.poses) if target.mirrored else plan.poses
-    _write(plan, {layout.POSES: agree_poses(plan.writer, poses)})
+    _write(plan, {layout.POSES: agree_lines(plan.writer, layout.POSES, poses)})
 
 
 def write_heights(plan: RecordingPlan, height_m: float) -> None:

@@ -30,9 +30,8 @@ from carlasc.storage.protocol import Source
 from carlasc.storage.resuming import (
     RECORD,
     RECORD_FORMAT,
+    agree_lines,
     agree_metadata,
-    agree_poses,
-    agree_times,
     check_grid,
     check_name,
 )
@@ -248,8 +247,8 @@ def _prepare(inputs: SequenceInput, sink: Sink, plan: GridPlan, *, overwrite: bo
     exists = check_grid(writer, plan.grid, params, numbers, overwrite=overwrite)
     documents = {
         layout.METADATA: agree_metadata(writer, inputs.metadata),
-        layout.POSES: None if (poses := inputs.poses()) is None else agree_poses(writer, poses),
-        layout.TIMES: None if (times := inputs.times()) is None else agree_times(writer, times),
+        layout.POSES: agree_lines(writer, layout.POSES, inputs.poses()),
+        layout.TIMES: agree_lines(writer, layout.TIMES, inputs.times()),
         layout.CAMERAS: None if cameras == writer.read_document(layout.CAMERAS) else cameras,
         layout.params_file(plan.grid): to_json(params),
     }

@@ -96,7 +96,7 @@ def begin_predicted(
     overwrite: bool,
     run: Run,
 ) -> DerivedCopy:
-    """Begin a copy with predicted labels; see `DerivedCopy.begin`.
+    """Begin a copy with predicted labels; see `DerivedCopy`.
 
     Raises:
         ArgumentError: the name of the network, `by` of the settings, is empty or has several lines.
@@ -104,7 +104,7 @@ def begin_predicted(
     by = str(settings["by"])
     if not by.strip() or not by.isprintable():
         raise ArgumentError("by", expected="a name in one line", found=repr(by))
-    return DerivedCopy.begin(
+    return DerivedCopy(
         source,
         out,
         {**settings, "classes": None if classes is None else classes.to_dict()},

@@ -97,7 +97,7 @@ def label_motion(
     source = as_source(source)
     given = sequences_with_scans(source)
     inputs = scan_sequences_of(given, observe)
-    copy = DerivedCopy.begin(
+    copy = DerivedCopy(
         source,
         out,
         {"observe": repr(observe)},

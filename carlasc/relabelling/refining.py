@@ -116,7 +116,7 @@ def refine(
         for name in sorted(one.documents())
         if "/" not in name
     ]
-    copy = DerivedCopy.begin(
+    copy = DerivedCopy(
         source,
         out,
         {"poses": vars(poses), "texts": digest_of_bytes(b"\0".join(texts)).hex()},

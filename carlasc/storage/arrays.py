@@ -13,7 +13,7 @@ import math
 import os
 import zipfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -22,8 +22,8 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray
 from carlasc.errors import FormatError, MissingDataError, reading
+from carlasc.storage.files import damaged
 
-_LONGEST_HEADER = 1 << 14  # bytes; NumPy refuses headers of more than 10,000
 # bytes: smaller arrays are unpacked at any compression ratio: zeros compress very well
 _SMALL = 1 << 26  # fact: small-array
 _MOST_RATIO = 100  # largest compression ratio of larger arrays; Deflate reaches 1032
@@ -79,16 +79,12 @@ def parse_npy(data: bytes | memoryview, expected: ArrayFormat, where: str) -> An
         where: the file, for errors.
 
     Returns:
-        The array, in C order. It may be read-only.
+        The array, in C order.
 
     Raises:
         FormatError: the file has another type, shape or size, or is no .npy file.
     """
-    shape, fortran_order, dtype, start = _check_header(
-        io.BytesIO(data[:_LONGEST_HEADER]), len(data), expected, where
-    )
-    values = np.frombuffer(data, dtype, math.prod(shape), start)
-    return np.asarray(values.reshape(shape, order="F" if fortran_order else "C"), order="C")
+    return _read_array(io.BytesIO(data), len(data), expected, where)
 
 
 def read_npy(path: str | Path, expected: ArrayFormat) -> AnyArray:
@@ -116,11 +112,11 @@ def check_ratio(size: int, packed: int, where: str) -> None:
         FormatError: the array is large, and its ratio is higher than that of any real array.
     """
     if size > max(_SMALL, _MOST_RATIO * packed):
-        raise FormatError(
+        raise damaged(
             where,
-            expected=f"at most {_MOST_RATIO} times the {packed} packed bytes",
-            found=f"{size} unpacked bytes",
-            advice="the file was made to fill the memory: do not use it",
+            f"at most {_MOST_RATIO} times the {packed} packed bytes",
+            f"{size} unpacked bytes",
+            "the file was made to fill the memory: do not use it",
         )
 
 
@@ -133,11 +129,11 @@ def check_size(shape: tuple[int, ...], dtype: np.dtype[Any], what: str) -> None:
         FormatError: the array is too large; the message begins with `what`.
     """
     if math.prod(shape) * dtype.itemsize > _MOST_BYTES:
-        raise FormatError(
+        raise damaged(
             what,
-            expected=f"at most {_MOST_BYTES} bytes",
-            found=f"{dtype.name} of shape {_text(shape)}",
-            advice="the store is damaged, or was made to fill the memory",
+            f"at most {_MOST_BYTES} bytes",
+            f"{dtype.name} of shape {_text(shape)}",
+            "the store is damaged, or was made to fill the memory",
         )
 
 
@@ -162,7 +158,7 @@ class NpzFile:
             reading(where, "a .npy array in a whole zip"),
             self._archive.open(self._members[name]) as stream,
         ):
-            return _npy_header(stream)[2]
+            return _npy_header(stream)[1]
 
     def read(self, name: str, expected: ArrayFormat) -> AnyArray:
         """Return an array, in C order.
@@ -217,20 +213,14 @@ def open_npz(source: str | Path | bytes | memoryview, where: str = "") -> Iterat
         MissingDataError: the file does not exist.
         FormatError: the file is not a zip, is damaged, or cannot be read.
     """
-    if isinstance(source, bytes | memoryview):
-        with _archive(io.BytesIO(source), where) as archive:
-            yield archive
-    else:
-        with _opened(source) as file, _archive(file, where or str(source)) as archive:
-            yield archive
-
-
-@contextmanager
-def _archive(file: IO[bytes], where: str) -> Iterator[NpzFile]:
-    with reading(where, "an .npz file"):
-        archive = zipfile.ZipFile(file)
-        opened = NpzFile(archive, where)
-    with archive:
+    name = where or str(source)
+    with (
+        io.BytesIO(source) if isinstance(source, bytes | memoryview) else _opened(source) as file,
+        ExitStack() as stack,
+    ):
+        with reading(name, "an .npz file"):
+            archive = stack.enter_context(zipfile.ZipFile(file))
+            opened = NpzFile(archive, name)
         yield opened
 
 
@@ -249,20 +239,20 @@ def _opened(path: str | Path) -> Iterator[IO[bytes]]:
         yield file
 
 
-def _npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return shape, whether the order is Fortran, and type from the header of a .npy file."""
+def _npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Return shape and type from the header of a .npy file."""
     version = np.lib.format.read_magic(stream)
     if version not in _READERS:
         raise ValueError(f"version {version} of the .npy format")
-    header: tuple[tuple[int, ...], bool, np.dtype[Any]] = _READERS[version](stream)
-    return header
+    shape, _, dtype = _READERS[version](stream)
+    return shape, dtype
 
 
 def _read_array(
     stream: IO[bytes], length: int, expected: ArrayFormat, where: str, packed: int | None = None
 ) -> AnyArray:
     """Return the array of a .npy file of `length` bytes, which are `packed` bytes in a zip."""
-    shape, *_ = _check_header(stream, length, expected, where)
+    shape = _check_header(stream, length, expected, where)
     if packed is not None:
         check_ratio(length, packed, where)
     with reading(where, "a .npy array"):
@@ -274,17 +264,14 @@ def _read_array(
 
 def _check_header(
     stream: IO[bytes], length: int, expected: ArrayFormat, where: str
-) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
-    """Read the header of a .npy file, and check it against the expected format and the length of
-    the file.
+) -> tuple[int, ...]:
+    """Read the header of a .npy file, check it against the expected format and the length of the
+    file, and return the shape.
 
     NumPy parses its text as a Python literal of at most 10,000 characters. No code is run.
-
-    Returns:
-        Shape, whether the order is Fortran, type, and the first byte of the values.
     """
     with reading(where, "a .npy array"):
-        shape, fortran_order, dtype = _npy_header(stream)
+        shape, dtype = _npy_header(stream)
         start = stream.tell()
     wanted, count = expected.shape, math.prod(shape)
     # An empty array of shape (0,) is accepted as (0, K): CarlaSC has such files for an empty list
@@ -309,13 +296,13 @@ def _check_header(
     if expected.most is not None and count > expected.most:
         raise FormatError(where, expected=f"at most {expected.most} values", found=_text(shape))
     if length != size:
-        raise FormatError(
+        raise damaged(
             where,
-            expected=f"{size} bytes ({_text(shape)} {dtype.name})",
-            found=str(length),
-            advice="the file is cut short, or something was added",
+            f"{size} bytes ({_text(shape)} {dtype.name})",
+            str(length),
+            "the file is cut short, or something was added",
         )
-    return shape, fortran_order, dtype, start
+    return shape
 
 
 def _text(shape: tuple[int | None, ...]) -> str:

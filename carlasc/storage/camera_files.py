@@ -65,16 +65,13 @@ def cameras_from_json(data: bytes, where: str, axes: Axes) -> dict[str, CameraMo
             raise FormatError(
                 where, expected="a different name for each camera", found=f"two named {camera.name}"
             )
-        if (np.linalg.det(camera.sensor_T_camera[:3, :3]) > 0) != (axes == "right"):
-            expected, found = (
-                ("a rotation", "a reflection")
-                if axes == "right"
-                else ("a reflection", "a rotation")
-            )
+        kinds = {"right": "a rotation", "left": "a reflection"}
+        found = kinds["right" if np.linalg.det(camera.sensor_T_camera[:3, :3]) > 0 else "left"]
+        if found != kinds[axes]:
             advice = f"convert sensor_T_camera to the {axes}-handed axes of the scans"
             raise FormatError(
                 f"{where}: {camera.name}: sensor_T_camera",
-                expected=expected,
+                expected=kinds[axes],
                 found=found,
                 advice=advice,
             )

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from collections.abc import Sequence as Series
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePath, PurePosixPath
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from carlasc.errors import ConflictError
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
-from carlasc.storage.files import unfinished
+from carlasc.storage.files import AnyPath, unfinished
 from carlasc.storage.folder import FolderSink
 from carlasc.storage.opening import as_source
 from carlasc.storage.packed.output import put_in_place
@@ -150,17 +150,15 @@ def typical_rows(sequence: Sequence) -> dict[str, int]:
     return found
 
 
-def refuse_overlap(out: str | os.PathLike[str], source: Source) -> None:
+def refuse_overlap(out: AnyPath, source: Source) -> None:
     """Check that the output and the source do not contain each other.
 
     Raises:
         ConflictError: one is inside the other.
     """
-    place: PurePath = PurePosixPath(os.fspath(out)) if is_url(out) else Path(out).resolve()
-    origin: PurePath = (
-        PurePosixPath(source.location)
-        if is_url(source.location)
-        else Path(source.location).resolve()
+    place, origin = (
+        PurePosixPath(os.fspath(one)) if is_url(one) else Path(one).resolve()
+        for one in (out, source.location)
     )
     if place == origin or place.is_relative_to(origin) or origin.is_relative_to(place):
         raise ConflictError(
@@ -194,8 +192,8 @@ class UnpackResult:
 
 
 def unpack(
-    source: str | os.PathLike[str] | Source,
-    out: str | os.PathLike[str],
+    source: AnyPath | Source,
+    out: AnyPath,
     *,
     overwrite: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
@@ -228,16 +226,16 @@ def unpack(
     source = as_source(source)
     refuse_overlap(out, source)
     result = UnpackResult(str(out) if is_url(out) else Path(out))
-    in_place = overwrite or run.part.count > 1 or not isinstance(result.out, Path)
-    if isinstance(result.out, Path) and result.out.exists() and not in_place:
+    # renamed when it is complete; object stores and several parts write to their place
+    final = None if is_url(out) or overwrite or run.part.count > 1 else Path(out)
+    if final is not None and final.exists():
         raise ConflictError(
-            result.out,
+            final,
             expected="a new path",
-            found="a folder" if result.out.is_dir() else "a file",
+            found="a folder" if final.is_dir() else "a file",
             advice="choose another name, or give `overwrite=True`",
         )
-    folder = result.out if in_place or not isinstance(result.out, Path) else unfinished(result.out)
-    sink, blocks = FolderSink(folder), []
+    sink, blocks = FolderSink(result.out if final is None else unfinished(final)), []
     for path, sequence in source.sequences().items():
         result.sequences.append(path)
         writer = sink.sequence(path)
@@ -248,7 +246,7 @@ def unpack(
             copy_documents(sequence, writer)
         blocks += blocks_of(sequence, writer, _BLOCK)
     result.files, result.kept = copy_blocks(blocks, run, again=overwrite)
-    if isinstance(folder, Path) and isinstance(result.out, Path) and folder != result.out:
-        put_in_place(folder, result.out, overwrite=False)
+    if final is not None:
+        put_in_place(unfinished(final), final, overwrite=False)
     result.elapsed_s = time.perf_counter() - began
     return result

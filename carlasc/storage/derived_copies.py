@@ -16,7 +16,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +25,15 @@ from carlasc.errors import ConflictError, MissingDataError
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.copying import UnpackResult, refuse_overlap, unpack
-from carlasc.storage.files import make_folder, replaced, sync_all, to_json, unfinished, write_atomic
+from carlasc.storage.files import (
+    AnyPath,
+    make_folder,
+    replaced,
+    sync_all,
+    to_json,
+    unfinished,
+    write_atomic,
+)
 from carlasc.storage.folder import FolderSequence, FolderSink, FolderSource
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.packed.output import remove
@@ -146,7 +154,6 @@ def sequences_with_scans(source: Source) -> dict[str, Sequence]:
     return found
 
 
-@dataclass(frozen=True)
 class DerivedCopy:
     """A copy of a data set that is being written.
 
@@ -158,23 +165,17 @@ class DerivedCopy:
             and in runs of several parts.
     """
 
-    source: Source
-    out: str | os.PathLike[str]
-    overwrite: bool
-    mark: Path | None
-
-    @classmethod
-    def begin(
-        cls,
+    def __init__(
+        self,
         source: Source,
-        out: str | os.PathLike[str],
+        out: AnyPath,
         made_from: Mapping[str, Any],
         *,
         kind: str,
         is_kind: Callable[[Metadata], bool],
         overwrite: bool,
         run: Run,
-    ) -> Self:
+    ) -> None:
         """Begin a copy, or continue an interrupted one.
 
         Args:
@@ -195,12 +196,12 @@ class DerivedCopy:
         """
         run.part.refuse(overwrite)
         refuse_overlap(out, source)
-        mark = None
+        self.source, self.out, self.overwrite = source, out, overwrite
+        self.mark: Path | None = None
         if not is_url(out) and run.part.count == 1:
             _clear(Path(out), kind, is_kind, overwrite=overwrite)
             settings = {"source": source.location, "kind": kind, **made_from}
-            mark = _mark(unfinished(Path(out)), settings, overwrite=overwrite)
-        return cls(source, out, overwrite, mark)
+            self.mark = _mark(unfinished(Path(out)), settings, overwrite=overwrite)
 
     def writer(self, path: str) -> SequenceWriter | None:
         """Return the writer for data derived from a sequence, kept until the copy is complete; None

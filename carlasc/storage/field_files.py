@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -12,13 +13,21 @@ from carlasc.core.arrays import AnyArray, Float32Array
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError
 from carlasc.storage.arrays import ArrayFormat, npz_bytes, open_npz
+from carlasc.storage.files import damaged
 
 VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "u1"), ("votes", "<u2")])
 WIDE_VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "<u2"), ("votes", "<u2")])
 VELOCITY_DTYPE = np.dtype([("voxel", "<i4"), ("velocity", "<f2", (3,))])
-# Level 6, the default of zlib, takes 6 times as long and saves only 3 %: voxels are sorted, so
-# repeats are always four bytes apart.
-_VOTES_LEVELS = {"voxel": 1, "label": 4, "votes": 4}
+TABLES = {
+    "votes": (VOTES_DTYPE, WIDE_VOTES_DTYPE),
+    "velocities": (VELOCITY_DTYPE,),
+    "boxes": (BOXES_DTYPE,),
+}
+"""The types of a row of a table, by the kind of the field."""
+# Level 6, the default of zlib, takes 6 times as long and saves only 3 %: the voxels of votes are
+# sorted, so repeats are always four bytes apart.
+_LEVELS = {"votes": (1, 4, 4), "velocities": (4, 4)}  # of the columns
+_READ_FIRST = ("label", "voxel", "velocity", "votes")  # the order in which columns are read
 _MOST_CLASSES = 256
 
 Per = Literal["point", "voxel", "vote", "moving voxel", "box", "scan"]
@@ -39,7 +48,7 @@ Kind = Literal[
 ]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Field:
     """The content of one file per frame.
 
@@ -73,12 +82,17 @@ class Field:
     names: tuple[str, ...]
     unit: str
     meaning: str
-    published: bool = True
+    published: bool = False
 
     @property
     def columns(self) -> int | None:
         """Number of values per row; None for a flat array."""
         return len(self.names) if self.kind in ("position", "vector", "pairs") else None
+
+    @property
+    def row_bytes(self) -> int:
+        """Size of a row of the file; not for tables in an .npz file."""
+        return np.dtype(self.dtype or BOXES_DTYPE).itemsize * (self.columns or 1)
 
     def file(self, frame: int) -> str:
         """Return the path of a frame's file under `<coordinates>/`."""
@@ -98,33 +112,27 @@ class Field:
         Raises:
             FormatError: the size of the file does not match.
         """
-        if self.kind == "votes":
-            return _decode_votes(data, where, shape)
-        if self.kind == "velocities":
-            return _decode_velocities(data, where, shape)
-        if self.kind == "boxes":
-            return _decode_boxes(data, where)
-        dtype, row = np.dtype(self.dtype), np.dtype(self.dtype).itemsize * (self.columns or 1)
-        size = len(data)
+        if self.kind in _LEVELS:
+            return _decode_npz(self.kind, data, where, shape)
+        dtype, size = np.dtype(self.dtype or BOXES_DTYPE), len(data)
         if shape is not None and size != self.size_of(shape):
             expected = f"{self.size_of(shape)} bytes ({' x '.join(map(str, shape))} {dtype.name})"
-            raise FormatError(
-                where,
-                expected=expected,
-                found=str(size),
-                advice="the file is cut short, or belongs to another grid",
+            raise damaged(
+                where, expected, str(size), "the file is cut short, or belongs to another grid"
             )
-        if size % row:
-            raise FormatError(
+        columns = self.columns
+        if size % (dtype.itemsize * (columns or 1)):
+            row = f"{columns} {dtype.name} per row" if columns else f"one {self.per}"
+            raise damaged(
                 where,
-                expected=f"a multiple of {row} bytes ({self.columns or 1} {dtype.name} per row)",
-                found=str(size),
-                advice="the file may be cut short",
+                f"a multiple of {self.row_bytes} bytes ({row})",
+                str(size),
+                "the file may be cut short",
             )
         array = np.frombuffer(data, dtype)
         if shape is not None:
             return array.reshape(shape)
-        return array if self.columns is None else array.reshape(-1, self.columns)
+        return array if columns is None else array.reshape(-1, columns)
 
     def size_of(self, shape: tuple[int, ...] | None) -> int | None:
         """Return the size in bytes of a file of a grid with this shape; None if it is known only
@@ -143,13 +151,11 @@ class Field:
             FormatError: the shape or the type of the array does not match the field.
         """
         self.check(array, where)
-        if self.kind == "votes":
-            return _encode_votes(array)
-        if self.kind == "velocities":
-            return npz_bytes({name: (np.ascontiguousarray(array[name]), 4) for name in self.names})
-        if self.kind == "boxes":
-            return array.tobytes()
-        return np.ascontiguousarray(array, np.dtype(self.dtype)).reshape(-1).view(np.uint8).data
+        if self.kind in _LEVELS:
+            levels = zip(self.names, _LEVELS[self.kind], strict=True)
+            return npz_bytes({name: (np.ascontiguousarray(array[name]), n) for name, n in levels})
+        dtype = np.dtype(self.dtype or BOXES_DTYPE)
+        return np.ascontiguousarray(array, dtype).reshape(-1).view(np.uint8).data
 
     def check(self, array: AnyArray, where: str) -> None:
         """Check that an array has the shape and the type of a frame of the field.
@@ -157,22 +163,11 @@ class Field:
         Raises:
             FormatError: the shape or the type does not match; the message names the file `where`.
         """
-        if self.kind == "votes":
-            if array.dtype not in (VOTES_DTYPE, WIDE_VOTES_DTYPE):
-                raise FormatError(
-                    where, expected="a table of voxel, label and votes", found=str(array.dtype)
-                )
-            return
-        if self.kind == "velocities":
-            if array.dtype != VELOCITY_DTYPE or array.ndim != 1:
+        if self.kind in TABLES:
+            if array.dtype not in TABLES[self.kind] or array.ndim != 1:
+                expected = f"a table of {self.kind}: {', '.join(self.names)}"
                 found = f"{array.dtype}, shape {array.shape}"
-                raise FormatError(where, expected="a table of voxel and velocity", found=found)
-            return
-        if self.kind == "boxes":
-            if array.dtype != BOXES_DTYPE or array.ndim != 1:
-                raise FormatError(
-                    where, expected="a table of boxes", found=f"{array.dtype}, shape {array.shape}"
-                )
+                raise FormatError(where, expected=expected, found=found)
             return
         if self.columns is not None and (array.ndim != 2 or array.shape[1] != self.columns):
             raise FormatError(where, expected=f"shape (N, {self.columns})", found=f"{array.shape}")
@@ -185,30 +180,31 @@ class Field:
             )
 
 
-def _decode_votes(data: bytes | memoryview, where: str, shape: tuple[int, ...] | None) -> AnyArray:
-    # The largest possible table: one row per voxel and class.
-    most = None if shape is None else _MOST_CLASSES * math.prod(shape)
-    with open_npz(data, where) as archive:
-        labels = archive.read("label", ArrayFormat(("u1", "<u2"), (None,), most))
-        votes = np.empty(len(labels), VOTES_DTYPE if labels.itemsize == 1 else WIDE_VOTES_DTYPE)
-        votes["label"] = labels
-        for name in ("voxel", "votes"):
-            votes[name] = archive.read(name, ArrayFormat((VOTES_DTYPE[name].str,), labels.shape))
-    return votes
-
-
-def _decode_velocities(
-    data: bytes | memoryview, where: str, shape: tuple[int, ...] | None
+def _decode_npz(
+    kind: Kind, data: bytes | memoryview, where: str, shape: tuple[int, ...] | None
 ) -> AnyArray:
+    """Return the table of an .npz file: that one of its kind which has the types of the columns."""
+    # The largest possible table: one row per voxel, and per class for votes.
+    most = None if shape is None else math.prod(shape) * (_MOST_CLASSES if kind == "votes" else 1)
+    tables, columns = TABLES[kind], dict[str, AnyArray]()
+    count: int | None = None
     with open_npz(data, where) as archive:
-        voxels = archive.read(
-            "voxel", ArrayFormat(("<i4",), (None,), None if shape is None else math.prod(shape))
-        )
-        table = np.empty(len(voxels), VELOCITY_DTYPE)
-        table["voxel"], table["velocity"] = (
-            voxels,
-            archive.read("velocity", ArrayFormat(("<f2",), (len(voxels), 3))),
-        )
+        for name in sorted(tables[0].names or (), key=_READ_FIRST.index):
+            dtypes = tuple(table[name].base.str for table in tables)
+            wanted = ArrayFormat(dtypes, (count, *tables[0][name].shape), most)
+            columns[name] = archive.read(name, wanted)
+            count, most = len(columns[name]), None
+    found = next(
+        table for table in tables if all(table[n].base == c.dtype for n, c in columns.items())
+    )
+    return join_table(found, columns)
+
+
+def join_table(dtype: np.dtype[Any], columns: Mapping[str, AnyArray]) -> AnyArray:
+    """Return the table of some columns."""
+    table = np.empty(len(next(iter(columns.values()))), dtype)
+    for name, column in columns.items():
+        table[name] = column
     return table
 
 
@@ -236,18 +232,3 @@ def dense_velocity(velocity: AnyArray, size: tuple[int, ...], where: str) -> Flo
     dense = np.zeros((*size, 3), np.float32)
     dense.reshape(-1, 3)[velocity["voxel"]] = velocity["velocity"]
     return dense
-
-
-def _decode_boxes(data: bytes | memoryview, where: str) -> AnyArray:
-    if len(data) % BOXES_DTYPE.itemsize:
-        raise FormatError(
-            where,
-            expected=f"a multiple of {BOXES_DTYPE.itemsize} bytes (one box)",
-            found=str(len(data)),
-            advice="the file may be cut short",
-        )
-    return np.frombuffer(data, BOXES_DTYPE)
-
-
-def _encode_votes(votes: AnyArray) -> bytes:
-    return npz_bytes({name: (votes[name], level) for name, level in _VOTES_LEVELS.items()})

@@ -24,6 +24,8 @@ from typing import Any, BinaryIO
 
 from carlasc.errors import ArgumentError, ConflictError, FormatError, StorageError, describe
 
+AnyPath = str | os.PathLike[str]
+"""A path, as a text or as an object."""
 Content = bytes | memoryview | Callable[[BinaryIO], object]
 
 
@@ -47,26 +49,20 @@ def write_atomic(path: Path, content: Content, *, create: bool = False) -> bool:
     Raises:
         StorageError: the disk is full or the folder cannot be written to; nothing is left behind.
     """
-    temporary = _temporary(path)
-    try:
-        _write(temporary, content)
-        sync_all([temporary])
-        if create:
-            # unlike a rename, a link fails if another process has written the file
-            os.link(temporary, path)
-            # before the folder is synced, otherwise a power failure could restore it
-            temporary.unlink()
+    with _written({path: content}) as temporaries:
+        if not create:
+            temporaries[path].replace(path)
         else:
-            temporary.replace(path)
+            try:
+                # unlike a rename, a link fails if another process has written the file
+                os.link(temporaries[path], path)
+            except FileExistsError:
+                if path.is_file():
+                    return False
+                raise
+            # before the folder is synced, otherwise a power failure could restore it
+            temporaries[path].unlink()
         sync_all([path.parent])
-    except FileExistsError as error:
-        if create and path.is_file():
-            return False
-        raise storage_error(path, error) from error
-    except OSError as error:
-        raise storage_error(path, error) from error
-    finally:
-        _remove(temporary)
     return True
 
 
@@ -83,16 +79,35 @@ def write_many(*groups: Mapping[Path, Content]) -> None:
         StorageError: a file cannot be written. Files of its group that were not renamed yet, and of
             later groups, do not exist.
     """
-    temporaries = {path: _temporary(path) for group in groups for path in group}
-    path = Path()
-    try:
-        for path, content in (file for group in groups for file in group.items()):
-            _write(temporaries[path], content)
-        sync_all(temporaries.values())
+    with _written({path: content for group in groups for path, content in group.items()}) as named:
         for group in groups:
             for path in group:
-                temporaries[path].replace(path)
+                named[path].replace(path)
             sync_all(path.parent for path in group)
+
+
+@contextmanager
+def _written(files: Mapping[Path, Content]) -> Iterator[Mapping[Path, Path]]:
+    """Write and sync files under temporary names, which are removed at the end of the block.
+
+    Yields:
+        The temporary names, by path.
+
+    Raises:
+        StorageError: a file cannot be written; also for an OSError in the block.
+    """
+    temporaries = {path: _temporary(path) for path in files}
+    path = Path()
+    try:
+        for path, content in files.items():
+            make_folder(path.parent)
+            with temporaries[path].open("xb") as file:
+                if callable(content):
+                    content(file)
+                else:
+                    file.write(content)
+        sync_all(temporaries.values())
+        yield temporaries
     except OSError as error:
         named = {str(temporary): path for path, temporary in temporaries.items()}
         raise storage_error(named.get(error.filename, path), error) from error
@@ -109,15 +124,6 @@ def _temporary(path: Path) -> Path:
     return path.with_name(f".{path.name}.{_HOST}-{os.getpid()}.{os.urandom(4).hex()}{_PART}")
 
 
-def _write(temporary: Path, content: Content) -> None:
-    make_folder(temporary.parent)
-    with temporary.open("xb") as file:
-        if callable(content):
-            content(file)
-        else:
-            file.write(content)
-
-
 def _remove(temporary: Path) -> None:
     with suppress(OSError):  # it does not exist after success; its folder may not exist either
         temporary.unlink()
@@ -132,7 +138,7 @@ def write_at(descriptor: int, data: bytes | memoryview, offset: int) -> None:
             view = view[os.write(descriptor, view) :]
 
 
-def has_content(path: str | os.PathLike[str]) -> bool:
+def has_content(path: AnyPath) -> bool:
     """Whether a file exists and is not empty.
 
     A power failure can leave empty files, if they were not written durably.
@@ -174,19 +180,13 @@ def check_target(out: Path, endings: tuple[str, ...], overwrite: bool) -> None:
         )
 
 
-def remove_stale(folder: Path, *, deep: bool = False) -> None:
-    """Remove the temporary files of killed processes in a folder and its direct subfolders; with
-    `deep`, also one level deeper.
+def remove_stale(folder: Path) -> None:
+    """Remove the temporary files of killed processes in a folder and everything below it.
 
     A temporary file is stale if the process on this machine that wrote it has ended, or if it is a
     day old.
     """
-    parts = (
-        folder.rglob(f".*{_PART}")
-        if deep
-        else (*folder.glob(f".*{_PART}"), *folder.glob(f"*/.*{_PART}"))
-    )
-    _remove_ended(parts)
+    _remove_ended(folder.rglob(f".*{_PART}"))
 
 
 def _remove_ended(parts: Iterable[Path]) -> None:
@@ -207,16 +207,15 @@ def _is_alive(process: int) -> bool:
     if os.name == "nt":  # there, os.kill ends the process
         return True
     try:
-        os.kill(process, 0)  # signal 0 only checks that the process exists
+        with suppress(PermissionError):
+            os.kill(process, 0)  # signal 0 only checks that the process exists
     except ProcessLookupError:
         return False
-    except PermissionError:
-        return True
     return True
 
 
 @contextmanager
-def writing(place: str | os.PathLike[str]) -> Iterator[None]:
+def writing(place: AnyPath) -> Iterator[None]:
     """Turn an OSError into a StorageError of the file that it names, otherwise of `place`."""
     try:
         yield
@@ -224,7 +223,7 @@ def writing(place: str | os.PathLike[str]) -> Iterator[None]:
         raise storage_error(Path(error.filename or place), error) from error
 
 
-def storage_error(path: Path, error: OSError) -> StorageError:
+def storage_error(path: AnyPath, error: OSError) -> StorageError:
     """Return the StorageError for a file that cannot be written."""
     advice = {
         errno.ENOSPC: _FREE_SPACE,
@@ -238,9 +237,13 @@ def storage_error(path: Path, error: OSError) -> StorageError:
     )
 
 
-def damaged(where: str | os.PathLike[str], expected: str, found: str) -> FormatError:
-    """Return the error of a store whose parts do not fit each other."""
-    return FormatError(where, expected=expected, found=found, advice="the store is damaged")
+def damaged(
+    where: AnyPath, expected: str, found: str, advice: str = "the store is damaged"
+) -> FormatError:
+    """Return the error of a file or a store that is damaged, or whose parts do not fit each
+    other.
+    """
+    return FormatError(where, expected=expected, found=found, advice=advice)
 
 
 def write_json(path: Path, value: Any) -> None:

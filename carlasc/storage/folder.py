@@ -5,22 +5,18 @@ The writer supports object stores too.
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from carlasc.core.arrays import AnyArray
-from carlasc.core.grids import GridSpec
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import MissingDataError
 from carlasc.storage import field_files, layout
-from carlasc.storage.files import parse_json, remove_stale
+from carlasc.storage.files import AnyPath, remove_stale
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.published import PublishedSequence, PublishedSource
-from carlasc.storage.sinks import SequenceWriter, Sink
+from carlasc.storage.sinks import FrameArrays, SequenceWriter, Sink
 from carlasc.storage.transport.targets import LocalTarget, Target, target_of
 from carlasc.storage.transport.trees import LocalTree
 
@@ -36,7 +32,7 @@ class FolderSource(PublishedSource):
     folder.
     """
 
-    def __init__(self, source: str | os.PathLike[str]) -> None:
+    def __init__(self, source: AnyPath) -> None:
         """Keep the path of the folder. It is listed when its sequences are first used.
 
         Raises:
@@ -84,7 +80,7 @@ class FolderSink(Sink):
 
     is_readable = True
 
-    def __init__(self, out: str | os.PathLike[str] | Target, **storage_options: Any) -> None:
+    def __init__(self, out: AnyPath | Target, **storage_options: Any) -> None:
         """Keep a folder, or its URL with options of fsspec. Nothing is written yet.
 
         Raises:
@@ -122,19 +118,56 @@ class FolderWriter(SequenceWriter):
 
     concurrent = True
 
-    def __init__(self, folder: str | os.PathLike[str] | Target) -> None:
+    def __init__(self, folder: AnyPath | Target) -> None:
         self.target = target_of(folder)
         self.location = self.target.location
-        self._whole = WholeFiles(self.location) if isinstance(self.target, LocalTarget) else None
+        self._cells: dict[str, int] = {}  # voxels of each grid whose params.json has been read
 
     def has(self, field: str, frame: int) -> bool:
-        """Whether the file exists and has a valid size.
+        """Whether the file exists and has a valid size; in an object store, only whether it exists:
+        its folder is listed once.
 
-        In an object store, its folder is listed once.
+        A power failure can leave empty and short files, unless they were written durably (see
+        `carlasc.storage.files`). Checking the size costs little more than checking that the file
+        exists.
+
+        The size of a grid follows from params.json. Fields with one row per point must have as many
+        rows as `points`, and `points` as many as `labels`. Tables of votes or velocities must have
+        the end record of a zip. A file of boxes may be empty, and so may a scan whose points and
+        labels are both empty.
         """
-        if self._whole is not None:
-            return self._whole.has(field, frame)
-        return self.target.tree.is_file(layout.field_named(field).file(frame))
+        entry = layout.field_named(field)
+        if not isinstance(self.target, LocalTarget):
+            return self.target.tree.is_file(entry.file(frame))
+        size = self._size(entry, frame)
+        if size is None:
+            return False
+        if entry.kind == "boxes":
+            return True
+        if entry.per == "voxel":
+            cells = self._cells.get(entry.folder) or self.cells_of(entry.folder)
+            if cells is None:
+                return size > 0
+            self._cells[entry.folder] = cells
+            return size == cells * entry.row_bytes
+        if entry.kind in ("votes", "velocities"):
+            return self._ends_as_zip(entry.file(frame), size)
+        if entry.per == "point":
+            other = layout.SCAN_FIELDS["labels" if field == "points" else "points"]
+            rows, beside = size / entry.row_bytes, self._size(other, frame)
+            return rows.is_integer() and (beside is None or beside / other.row_bytes == rows)
+        return size > 0
+
+    def _size(self, entry: field_files.Field, frame: int) -> int | None:
+        try:
+            return os.stat(f"{self.location}/{entry.file(frame)}").st_size
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+
+    def _ends_as_zip(self, path: str, size: int) -> bool:
+        with open(f"{self.location}/{path}", "rb", buffering=0) as file:
+            file.seek(max(0, size - _ZIP_END_BYTES))
+            return file.read(len(_ZIP_END)) == _ZIP_END
 
     def refresh(self) -> None:
         """Forget the listings of folders in an object store."""
@@ -144,7 +177,7 @@ class FolderWriter(SequenceWriter):
         """Write one file."""
         self.target.put(*self._file(field, frame, array))
 
-    def write_frames(self, frames: Mapping[int, Mapping[str, AnyArray]]) -> None:
+    def write_frames(self, frames: FrameArrays) -> None:
         """Write the files of several frames in parallel.
 
         The last file of each frame is written after the other files of that frame.
@@ -183,8 +216,7 @@ class FolderWriter(SequenceWriter):
         ]
         self.target.remove_many(f"{grid}/{name}" for name in names)
         self.target.remove(layout.params_file(grid))
-        if self._whole is not None:
-            self._whole.forget(grid)
+        self._cells.pop(grid, None)
 
     def write_document(self, name: str, data: bytes) -> None:
         """Write a text file."""
@@ -201,78 +233,3 @@ class FolderWriter(SequenceWriter):
         failure.
         """
         return self.target.read(name) or None
-
-
-class WholeFiles:
-    """Checks by their sizes whether the files of frames in one `<coordinates>` folder are whole.
-
-    It can be pickled.
-
-    A power failure can leave empty and short files, unless they were written durably (see
-    `carlasc.storage.files`). Checking the size costs little more than checking that the file
-    exists.
-
-    Args:
-        folder: the folder.
-    """
-
-    def __init__(self, folder: str) -> None:
-        self._folder = folder
-        # number of voxels of each grid whose params.json has been read
-        self._cells: dict[str, int] = {}
-
-    def has(self, name: str, frame: int) -> bool:
-        """Whether the file of a field exists and has a valid size.
-
-        The size of a grid follows from params.json. Fields with one row per point must have as many
-        rows as `points`, and `points` as many as `labels`. Tables of votes or velocities must have
-        the end record of a zip. A file of boxes may be empty, and so may a scan whose points and
-        labels are both empty.
-        """
-        entry = layout.field_named(name)
-        size = self._size(entry, frame)
-        if size is None:
-            return False
-        if entry.kind == "boxes":
-            return True
-        if entry.per == "voxel":
-            cells = self._cells_of(entry.folder)
-            return size > 0 if cells is None else size == cells * np.dtype(entry.dtype).itemsize
-        if entry.kind in ("votes", "velocities"):
-            return self._ends_as_zip(entry.file(frame), size)
-        if entry.per == "point":
-            other = layout.SCAN_FIELDS["labels" if name == "points" else "points"]
-            rows, beside = size / _row(entry), self._size(other, frame)
-            return rows.is_integer() and (beside is None or beside / _row(other) == rows)
-        return size > 0
-
-    def forget(self, grid: str) -> None:
-        """Discard the known size of a grid that is replaced."""
-        self._cells.pop(grid, None)
-
-    def _size(self, entry: field_files.Field, frame: int) -> int | None:
-        try:
-            return os.stat(f"{self._folder}/{entry.file(frame)}").st_size
-        except (FileNotFoundError, NotADirectoryError):
-            return None
-
-    def _ends_as_zip(self, path: str, size: int) -> bool:
-        with open(f"{self._folder}/{path}", "rb", buffering=0) as file:
-            file.seek(max(0, size - _ZIP_END_BYTES))
-            return file.read(len(_ZIP_END)) == _ZIP_END
-
-    def _cells_of(self, grid: str) -> int | None:
-        """Return the number of voxels of a grid; None if it is not known."""
-        if grid not in self._cells:
-            where = f"{self._folder}/{layout.params_file(grid)}"
-            try:
-                with open(where, "rb") as file:
-                    spec = GridSpec.from_params(parse_json(file.read(), where), where)
-            except (FileNotFoundError, FormatError):
-                return None
-            self._cells[grid] = math.prod(spec.size)
-        return self._cells[grid]
-
-
-def _row(entry: field_files.Field) -> int:
-    return np.dtype(entry.dtype).itemsize * (entry.columns or 1)

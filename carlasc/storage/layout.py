@@ -48,123 +48,63 @@ FRAME_PERIOD_S = 0.1  # scans are recorded at 10 Hz; fact: frame-period
 CERTAIN = 65535
 
 
-SCAN_FIELDS: dict[str, Field] = {
-    field.name: field
-    for field in (
-        Field(
-            name="points", folder="velodyne", suffix=".bin", per="point", kind="position",
-            dtype="<f4", names=("x", "y", "z", "fourth"), unit="m",
-            meaning="x, y, z in the sensor frame; 4th column a zero placeholder (KITTI: remission)",
-        ),
-        Field(
-            name="labels", folder="labels", suffix=".label", per="point", kind="class",
-            dtype="<u4", names=("label",), unit="class",
-            meaning="class of each point; 0 is unlabelled",
-        ),
-        Field(
-            name="probabilities", folder="probabilities", suffix=".bin", per="point", kind="pairs",
-            dtype="<u2", names=("class1", "share1", "class2", "share2", "class3", "share3"), unit="class, 1/65535",
-            meaning="the likeliest classes of each point, the first first: class and probability "
-                    "in 1/65535; 0 and 0 where there is none",
-            published=False,
-        ),
-        Field(
-            name="flow", folder="predictions", suffix=".bin", per="point", kind="vector",
-            dtype="<f4", names=("vx", "vy", "vz"), unit="m/s",
-            meaning="velocity of the actor hit, sensor frame, ego motion removed",
-        ),
-        Field(
-            name="instances", folder="instances", suffix=".label", per="point", kind="id",
-            dtype="<u4", names=("actor",), unit="actor",
-            meaning="actor of each point, 0 none, consistent over a sequence", published=False,
-        ),
-        Field(
-            name="seconds", folder="seconds", suffix=".bin", per="point", kind="value",
-            dtype="<f4", names=("seconds",), unit="s",
-            meaning="time of each point after the time of the frame", published=False,
-        ),
-        Field(
-            name="sensor", folder="sensor", suffix=".bin", per="point", kind="id",
-            dtype="u1", names=("sensor",), unit="sensor",
-            meaning="which of the sensors in carlasc.json took the point, from 0", published=False,
-        ),
-        Field(
-            name="origins", folder="origins", suffix=".bin", per="point", kind="vector",
-            dtype="<f4", names=("x", "y", "z"), unit="m",
-            meaning="where the ray of each point began, sensor frame; absent: at the origin", published=False,
-        ),
-        Field(
-            name="boxes", folder="boxes", suffix=".bin", per="box", kind="boxes",
-            dtype="", names=BOXES_DTYPE.names or (), unit="m",
-            meaning="tracked boxes: track, class, pose, size, whether annotated in this frame", published=False,
-        ),
-        Field(
-            name="bev", folder="bev", suffix=".jpg", per="scan", kind="picture",
-            dtype="u1", names=("jpeg",), unit="bytes",
-            meaning="bird's-eye camera picture, as its JPEG bytes",
-        ),
-    )
-}  # fmt: skip
-_GRID_FIELDS: dict[str, Field] = {
-    field.name: field
-    for field in (
-        Field(
-            name="labels", folder="", suffix=".label", per="voxel", kind="class",
-            dtype="<u4", names=("label",), unit="class",
-            meaning="class of each voxel; 0 is free, also where unknown",
-        ),
-        Field(
-            name="counts", folder="", suffix=".bin", per="voxel", kind="count",
-            dtype="<f4", names=("votes",), unit="votes",
-            meaning="votes of each voxel; 0 means unknown: never evaluated",
-        ),
-        Field(
-            name="votes", folder="", suffix=".votes.npz", per="vote", kind="votes",
-            dtype="", names=("voxel", "label", "votes"), unit="votes",
-            meaning="votes by class: voxel (flat index), label, votes; only non-zero ones", published=False,
-        ),
-        Field(
-            name="occupied", folder="", suffix=".occupied.bin", per="voxel", kind="probability",
-            dtype="<f2", names=("occupied",), unit="probability",
-            meaning="probability that the voxel is occupied; 0.5 where nothing is known", published=False,
-        ),
-        Field(
-            name="classes", folder="", suffix=".classes.npz", per="vote", kind="votes",
-            dtype="", names=("voxel", "label", "votes"), unit="1/65535",
-            meaning="probability of each class of a voxel if it is occupied, in 1/65535: voxel, "
-                    "label, votes; only non-zero ones",
-            published=False,
-        ),
-        Field(
-            name="flags", folder="", suffix=".flags.bin", per="voxel", kind="flags",
-            dtype="u1", names=("flags",), unit="bits",
-            meaning="what else is known of the voxel: 1 inferred, 2 contested, 4 seen now, 8 in an "
-                    "actor", published=False,
-        ),
-        Field(
-            name="views", folder="", suffix=".views.bin", per="voxel", kind="count",
-            dtype="<u2", names=("views",), unit="scans",
-            meaning="number of scans that saw the voxel", published=False,
-        ),
-        Field(
-            name="instance", folder="", suffix=".instance", per="voxel", kind="id",
-            dtype="<u4", names=("actor",), unit="actor",
-            meaning="actor that the voxel belongs to, 0 none, consistent over a sequence", published=False,
-        ),
-        Field(
-            name="velocity", folder="", suffix=".velocity.npz", per="moving voxel", kind="velocities",
-            dtype="", names=("voxel", "velocity"), unit="m/s",
-            meaning="velocity of each voxel that moves: voxel (flat index), velocity; sensor "
-                    "frame, ego motion removed",
-            published=False,
-        ),
-        Field(
-            name="seen", folder="", suffix=".seen", per="voxel", kind="flags",
-            dtype="u1", names=("seen",), unit="bits",
-            meaning="which cameras see the voxel: bit i for camera i of cameras.json", published=False,
-        ),
-    )
-}  # fmt: skip
+def _table(*fields: Field) -> dict[str, Field]:
+    return {field.name: field for field in fields}
+
+
+# The values of a row are, in this order: name, folder, suffix, per, kind, type, names of the values
+# of a row, unit, meaning (see `Field`).
+SCAN_FIELDS = _table(
+    Field("points", "velodyne", ".bin", "point", "position", "<f4", ("x", "y", "z", "fourth"),
+          "m", "x, y, z in the sensor frame; 4th column a zero placeholder (KITTI: remission)",
+          published=True),
+    Field("labels", "labels", ".label", "point", "class", "<u4", ("label",),
+          "class", "class of each point; 0 is unlabelled", published=True),
+    Field("probabilities", "probabilities", ".bin", "point", "pairs", "<u2",
+          ("class1", "share1", "class2", "share2", "class3", "share3"),
+          "class, 1/65535", "the likeliest classes of each point, the first first: class and "
+          "probability in 1/65535; 0 and 0 where there is none"),
+    Field("flow", "predictions", ".bin", "point", "vector", "<f4", ("vx", "vy", "vz"),
+          "m/s", "velocity of the actor hit, sensor frame, ego motion removed", published=True),
+    Field("instances", "instances", ".label", "point", "id", "<u4", ("actor",),
+          "actor", "actor of each point, 0 none, consistent over a sequence"),
+    Field("seconds", "seconds", ".bin", "point", "value", "<f4", ("seconds",),
+          "s", "time of each point after the time of the frame"),
+    Field("sensor", "sensor", ".bin", "point", "id", "u1", ("sensor",),
+          "sensor", "which of the sensors in carlasc.json took the point, from 0"),
+    Field("origins", "origins", ".bin", "point", "vector", "<f4", ("x", "y", "z"),
+          "m", "where the ray of each point began, sensor frame; absent: at the origin"),
+    Field("boxes", "boxes", ".bin", "box", "boxes", "", BOXES_DTYPE.names or (),
+          "m", "tracked boxes: track, class, pose, size, whether annotated in this frame"),
+    Field("bev", "bev", ".jpg", "scan", "picture", "u1", ("jpeg",),
+          "bytes", "bird's-eye camera picture, as its JPEG bytes", published=True),
+)  # fmt: skip
+_GRID_FIELDS = _table(
+    Field("labels", "", ".label", "voxel", "class", "<u4", ("label",),
+          "class", "class of each voxel; 0 is free, also where unknown", published=True),
+    Field("counts", "", ".bin", "voxel", "count", "<f4", ("votes",),
+          "votes", "votes of each voxel; 0 means unknown: never evaluated", published=True),
+    Field("votes", "", ".votes.npz", "vote", "votes", "", ("voxel", "label", "votes"),
+          "votes", "votes by class: voxel (flat index), label, votes; only non-zero ones"),
+    Field("occupied", "", ".occupied.bin", "voxel", "probability", "<f2", ("occupied",),
+          "probability", "probability that the voxel is occupied; 0.5 where nothing is known"),
+    Field("classes", "", ".classes.npz", "vote", "votes", "", ("voxel", "label", "votes"),
+          "1/65535", "probability of each class of a voxel if it is occupied, in 1/65535: "
+          "voxel, label, votes; only non-zero ones"),
+    Field("flags", "", ".flags.bin", "voxel", "flags", "u1", ("flags",),
+          "bits", "what else is known of the voxel: 1 inferred, 2 contested, 4 seen now, 8 in "
+          "an actor"),
+    Field("views", "", ".views.bin", "voxel", "count", "<u2", ("views",),
+          "scans", "number of scans that saw the voxel"),
+    Field("instance", "", ".instance", "voxel", "id", "<u4", ("actor",),
+          "actor", "actor that the voxel belongs to, 0 none, consistent over a sequence"),
+    Field("velocity", "", ".velocity.npz", "moving voxel", "velocities", "",
+          ("voxel", "velocity"),
+          "m/s", "velocity of each voxel that moves: voxel (flat index), velocity; sensor "
+          "frame, ego motion removed"),
+    Field("seen", "", ".seen", "voxel", "flags", "u1", ("seen",),
+          "bits", "which cameras see the voxel: bit i for camera i of cameras.json"),
+)  # fmt: skip
 IMAGE_FOLDERS = {
     "images": "image of a camera, as its JPEG or PNG bytes",
     "image_labels": "class of each pixel of a camera's image, as the bytes of an 8-bit or 16-bit "
@@ -221,8 +161,8 @@ def field_named(name: str) -> Field:
     camera, _, suffix = rest.rpartition(".")
     if folder in IMAGE_FOLDERS and camera and suffix in IMAGE_SUFFIXES and "/" not in name:
         return Field(
-            name=name, folder=f"{folder}/{camera}", suffix=f".{suffix}", per="scan", kind="picture",
-            dtype="u1", names=(suffix,), unit="bytes", meaning=IMAGE_FOLDERS[folder], published=False,
+            name, f"{folder}/{camera}", f".{suffix}", "scan", "picture", "u1", (suffix,),
+            "bytes", IMAGE_FOLDERS[folder],
         )  # fmt: skip
     raise FormatError(
         f"field {name!r}",

@@ -94,20 +94,9 @@ class Metadata:
 
         A class table that is not built into carlasc is written in full.
         """
-        values: dict[str, Any] = {
-            "format": FORMAT,
-            "axes": self.axes,
-            "classes": table_to_json(self.classes),
-        }
-        values |= {
-            "sensor": self.sensor,
-            "min_range_m": self.min_range_m,
-            "max_range_m": self.max_range_m,
-        }
-        values |= {"source": self.source}
-        return to_json(
-            {key: value for key, value in values.items() if value is not None} | dict(self.extra)
-        )
+        values = {"format": FORMAT, **vars(self), "classes": table_to_json(self.classes)}
+        extra = values.pop("extra")
+        return to_json({key: value for key, value in values.items() if value is not None} | extra)
 
 
 def _read_axes(values: dict[str, Any], where: str) -> Axes:

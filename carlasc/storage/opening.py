@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.running.spreading import Part
-from carlasc.storage.files import unfinished
+from carlasc.storage.files import AnyPath, damaged, unfinished
 from carlasc.storage.folder import FolderSink, FolderSource
 from carlasc.storage.packed.output import TABLES_MARK, UNFINISHED_MARK, unfinished_error
 from carlasc.storage.packed.stores import PackedSink, PackOptions
@@ -33,9 +33,9 @@ _SIGNATURE = 8  # number of leading bytes that identify the kind of file
 
 
 def open(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     *,
-    cache: str | os.PathLike[str] | Cache | None = None,
+    cache: AnyPath | Cache | None = None,
     **storage_options: Any,
 ) -> Source:
     """Open a store of sequences. Its kind is determined from its content, not from its suffix.
@@ -85,13 +85,13 @@ def _is_unfinished(path: Path) -> bool:
     return path.suffix == unfinished(Path("x")).suffix and path.with_suffix("").suffix in PACKED
 
 
-def as_source(source: str | os.PathLike[str] | Source) -> Source:
+def as_source(source: AnyPath | Source) -> Source:
     """Return a Source unchanged; open anything else with `open`."""
     return source if isinstance(source, Source) else open(source)
 
 
 def open_sink(
-    path: str | os.PathLike[str] | Target,
+    path: AnyPath | Target,
     options: PackOptions | None,
     overwrite: bool,
     **storage_options: Any,
@@ -133,7 +133,7 @@ def open_sink(
 
 
 def as_sink(
-    out: str | os.PathLike[str] | Target | Sink,
+    out: AnyPath | Target | Sink,
     *,
     overwrite: bool = False,
     part: Part = Part(),  # noqa: B008 (frozen)
@@ -165,7 +165,7 @@ def as_sink(
     return FolderSink(out, **storage_options)
 
 
-def _open_remote(tree: RemoteTree, cache: str | os.PathLike[str] | Cache | None) -> Source:
+def _open_remote(tree: RemoteTree, cache: AnyPath | Cache | None) -> Source:
     is_file = tree.size() is not None
     if cache is not None and (is_file or tree.is_file(TABLES_MARK)):
         raise ArgumentError(
@@ -215,11 +215,11 @@ def _open_file(tree: Tree, name: str) -> Source:
     try:
         signature = bytes(tree.read_range(name, 0, _SIGNATURE))
     except FormatError as error:
-        raise FormatError(
+        raise damaged(
             where,
-            expected="a zip or a packed store",
-            found=f"a file of less than {_SIGNATURE} bytes",
-            advice="the file may be cut short",
+            "a zip or a packed store",
+            f"a file of less than {_SIGNATURE} bytes",
+            "the file may be cut short",
         ) from error
     if signature.startswith((_ZIP, _EMPTY_ZIP)):
         inside = ZipTree(tree, name)

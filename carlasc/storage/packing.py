@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, cast
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from carlasc.core.arrays import AnyArray
-from carlasc.errors import ArgumentError, ConflictError, StorageError
+from carlasc.errors import ArgumentError, ConflictError
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.copying import (
@@ -27,11 +26,11 @@ from carlasc.storage.copying import (
     refuse_overlap,
     typical_rows,
 )
+from carlasc.storage.files import AnyPath, storage_error
 from carlasc.storage.opening import as_source, open, open_sink
 from carlasc.storage.packed.stores import PackedSink, PackedSource, PackOptions, check_names
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.published import PublishedSequence
-from carlasc.storage.sinks import SequenceWriter
 from carlasc.storage.transport.trees import is_url
 
 if TYPE_CHECKING:
@@ -74,8 +73,8 @@ class PackResult:
 
 
 def pack(
-    source: str | os.PathLike[str] | Source,
-    out: str | os.PathLike[str],
+    source: AnyPath | Source,
+    out: AnyPath,
     *,
     small: bool = False,
     lossy_mm: float | None = None,
@@ -119,8 +118,12 @@ def pack(
     began = time.perf_counter()
     options = PackOptions(small, lossy_mm)
     run.part.refuse(overwrite)
-    if PurePath(out).suffix != ".zarr":
-        _refuse_several(out, run)
+    if PurePath(out).suffix != ".zarr" and (run.executor is not None or run.part.count > 1):
+        raise ArgumentError(
+            "part" if run.executor is None else "executor",
+            expected="a .zarr store, which several processes can write",
+            found=str(out),
+        )
     source = as_source(source)
     refuse_overlap(out, source)
     result = PackResult(str(out) if is_url(out) else Path(out))
@@ -131,27 +134,20 @@ def pack(
         result.frames += len(sequence.scan_frames())
         if isinstance(sequence, PublishedSequence):
             result.left_out += [f"{path or '.'}: {name}" for name in sequence.unknown_files()]
-    with _writing(out):
+    try:
         sink = open_sink(out, options, overwrite)
         if isinstance(sink, PackedSink):
             result.published_bytes = _append(sequences, sink, run.progress, run.workers or _AHEAD)
             sink.finish()
         elif not _pack_blocks(sequences, sink, run):
             return replace(result, elapsed_s=time.perf_counter() - began)
+    except OSError as error:  # of the store; sources raise their own errors
+        raise storage_error(result.out, error) from error
     packed = cast(PackedSource, open(out))
     result.published_bytes = result.published_bytes or packed.published_bytes()
     result.stored_bytes, result.is_finished = packed.stored_bytes(), True
     result.elapsed_s = time.perf_counter() - began
     return result
-
-
-def _refuse_several(out: object, run: Run) -> None:
-    """Raise ArgumentError if several processes would write a store of one writer."""
-    for name, wanted in (("executor", run.executor is not None), ("part", run.part.count > 1)):
-        if wanted:
-            raise ArgumentError(
-                name, expected="a .zarr store, which several processes can write", found=str(out)
-            )
 
 
 def _pack_blocks(sequences: Mapping[str, Sequence], sink: ZarrSink, run: Run) -> bool:
@@ -185,65 +181,36 @@ def _pack_blocks(sequences: Mapping[str, Sequence], sink: ZarrSink, run: Run) ->
     return True
 
 
-@contextmanager
-def _writing(out: object) -> Iterator[None]:
-    """Turn an OSError of the store into a StorageError; sources raise their own errors."""
-    try:
-        yield
-    except OSError as error:
-        raise StorageError(
-            out,
-            problem=f"cannot be written: {error.strerror or error}",
-            advice="fix the cause and run the same command again to finish it",
-        ) from error
-
-
 def _append(
     sequences: Mapping[str, Sequence], sink: PackedSink, progress: Progress | None, threads: int
 ) -> dict[str, int]:
-    """Pack sequences one after the other, and return their published bytes by field."""
-    files = sum(
-        len(sequence.frames(name)) for sequence in sequences.values() for name in sequence.fields()
-    )
+    """Pack sequences one after the other, field by field, and return their published bytes by
+    field. Of sequences that are already packed, only the bytes are added up.
+    """
+    frames_of = {
+        path: {name: sequence.frames(name).tolist() for name in sorted(sequence.fields())}
+        for path, sequence in sequences.items()
+    }
+    files = sum(len(frames) for fields in frames_of.values() for frames in fields.values())
     step = StepCounter(progress, files)
     published: Counter[str] = Counter()
     for path, sequence in sequences.items():
-        finished = sink.finished(path)
-        with nullcontext() if finished else sink.sequence(path) as writer:
+        documents = {name: sequence.read_document(name) for name in sequence.documents()}
+        published["documents"] += sum(map(len, documents.values()))
+        with nullcontext() if sink.finished(path) else sink.sequence(path) as writer:
             if writer is not None:
                 writer.identity = (sequence.split, sequence.name, sequence.coordinates)
-            _append_sequence(sequence, writer, published, step, threads)
+                for name, data in documents.items():
+                    writer.write_document(name, data)
+                writer.expect(frames_of[path], typical_rows(sequence))
+            for name, frames in frames_of[path].items():
+                dtype = layout.field_named(name).dtype
+                for frame, array in _read_ahead(sequence, name, frames, threads):
+                    if writer is not None:
+                        writer.write(name, frame, array)
+                    published[name] += array.size * np.dtype(dtype or array.dtype).itemsize
+                    step(1)
     return dict(published)
-
-
-def _append_sequence(
-    sequence: Sequence,
-    writer: SequenceWriter | None,
-    published: Counter[str],
-    step: Callable[[int], None],
-    threads: int,
-) -> None:
-    """Copy a sequence field by field and add up its published bytes.
-
-    `writer` is None if the sequence is already packed.
-    """
-    documents = {name: sequence.read_document(name) for name in sequence.documents()}
-    published["documents"] += sum(map(len, documents.values()))
-    if writer is not None:
-        for name, data in documents.items():
-            writer.write_document(name, data)
-        writer.expect(
-            {name: sequence.frames(name).tolist() for name in sequence.fields()},
-            typical_rows(sequence),
-        )
-    for name in sorted(sequence.fields()):
-        entry, frames = layout.field_named(name), sequence.frames(name).tolist()
-        for frame, array in _read_ahead(sequence, name, frames, threads):
-            if writer is not None:
-                writer.write(name, frame, array)
-            itemsize = np.dtype(entry.dtype).itemsize if entry.dtype else array.itemsize
-            published[name] += array.size * itemsize
-            step(1)
 
 
 def _read_ahead(

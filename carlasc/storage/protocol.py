@@ -27,7 +27,7 @@ from carlasc.core.grids import Coordinates, Grid, GridSpec
 from carlasc.core.notebook import describe
 from carlasc.core.scans import Scan
 from carlasc.core.tables import table_from_json
-from carlasc.errors import FormatError, MissingDataError, MissingKeyError, first_names
+from carlasc.errors import FormatError, MissingDataError, MissingKeyError, first_names, within
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json
 from carlasc.storage.metadata import Metadata
@@ -354,10 +354,8 @@ class Sequence(ABC):
             if name in wanted & self.fields()
         }
         own = {name: read.pop(name) for name in ("labels", "flow", "instances") if name in read}
-        try:
+        with within(f"{self.location}: frame {frame}"):
             return Scan(points[:, :3], remission=points[:, 3], **own, others=read, boxes=boxes)
-        except FormatError as error:
-            raise error.within(f"{self.location}: frame {frame}") from error
 
     def boxes(self, frame: int) -> Boxes | None:
         """Read the tracked boxes of a frame; None if the frame is not annotated.
@@ -379,10 +377,8 @@ class Sequence(ABC):
             )
         counts = self.read(f"{name}/counts", frame) if f"{name}/counts" in self.fields() else None
         labels = cast(LabelArray, self.read(f"{name}/labels", frame))
-        try:
+        with within(f"{self.location}: frame {frame}"):
             return Grid(self.grids[name], labels, counts)
-        except FormatError as error:
-            raise error.within(f"{self.location}: frame {frame}") from error
 
     def __iter__(self) -> Iterator[int]:
         return iter(self.scan_frames().tolist())

@@ -32,6 +32,10 @@ RECORD_FORMAT = 1
 _RENAMED = {"source": "observe", "vote": "voting"}  # old and new keys of records without a format
 # metres, entries of a rotation, seconds: the last digits of poses.txt depend on the machine
 _TOLERANCE = 1e-6
+_LINES = {
+    layout.POSES: (layout.encode_poses, layout.decode_poses),
+    layout.TIMES: (layout.encode_times, layout.decode_times),
+}
 _LOOKED_AT = 16  # number of scans that are read to identify a sequence
 _OTHER_SETTINGS = "choose another `name`, or replace the grid with `overwrite=True`"
 _PUBLISHED = "this is published data, which is never written to: choose another `name` or `out`"
@@ -151,46 +155,34 @@ def _first_difference(existing: dict[str, Any], wanted: dict[str, Any]) -> str |
     return None
 
 
-def agree_poses(writer: SequenceWriter, poses: FloatArray) -> bytes | None:
-    """Return the poses.txt to write; None if the existing one is complete.
+def agree_lines(writer: SequenceWriter, document: str, ours: FloatArray | None) -> bytes | None:
+    """Return the poses.txt or times.txt to write; None if there is nothing to write.
 
-    Existing poses must be equal to those of this run. Lines without a pose (NaN: it could not be
+    Existing lines must be equal to those of this run. Lines without a pose (NaN: it could not be
     read) are filled in.
 
-    Raises:
-        ConflictError: an existing pose is different; the message names the frame.
-    """
-    data = writer.read_document(layout.POSES)
-    if data is None:
-        return layout.encode_poses(poses)
-    where = f"{writer.location}/{layout.POSES}"
-    merged = _merge(layout.decode_poses(data, where), poses, where)
-    return None if merged is None else layout.encode_poses(merged)
-
-
-def agree_times(writer: SequenceWriter, times: FloatArray) -> bytes | None:
-    """Return the times.txt to write; None if the existing one is complete.
+    Args:
+        writer: writes the sequence.
+        document: name of the file.
+        ours: (F, 4, 4) first_T_sensor, or (F,) seconds, of this run; None if it has none.
 
     Raises:
-        ConflictError: an existing time is different; the message names the frame.
+        ConflictError: an existing line is different; the message names the frame.
     """
-    data = writer.read_document(layout.TIMES)
+    if ours is None:
+        return None
+    encode, decode = _LINES[document]
+    data, where = writer.read_document(document), f"{writer.location}/{document}"
     if data is None:
-        return layout.encode_times(times)
-    where = f"{writer.location}/{layout.TIMES}"
-    merged = _merge(layout.decode_times(data, where), times, where)
-    return None if merged is None else layout.encode_times(merged)
-
-
-def _merge(existing: FloatArray, ours: FloatArray, where: str) -> FloatArray | None:
-    """Return the existing rows, completed by our rows; None if no row was missing."""
+        return encode(ours)
+    existing = decode(data, where)
     both = min(len(existing), len(ours))
     differs = np.abs(existing[:both] - ours[:both]) > _TOLERANCE  # False if either is NaN
     if differs.any():
         raise _other_data(where, int(np.argwhere(differs)[0, 0]))
     merged = np.concatenate([existing, ours[both:]])
     merged[:both] = np.where(np.isnan(existing[:both]), ours[:both], existing[:both])
-    return None if np.array_equal(merged, existing, equal_nan=True) else merged
+    return None if np.array_equal(merged, existing, equal_nan=True) else encode(merged)
 
 
 def agree_metadata(writer: SequenceWriter, metadata: Metadata) -> bytes | None:

@@ -6,14 +6,21 @@ frames.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
-from types import TracebackType
+from contextlib import suppress
 from typing import Self
 
 from carlasc.core.arrays import AnyArray
-from carlasc.errors import ConflictError
+from carlasc.core.grids import GridSpec
+from carlasc.errors import ConflictError, FormatError
+from carlasc.storage import layout
+from carlasc.storage.files import parse_json
 from carlasc.storage.protocol import Source
+
+FrameArrays = Mapping[int, Mapping[str, AnyArray]]
+"""The fields of frames: arrays by field, by frame number."""
 
 
 class SequenceWriter(ABC):
@@ -76,7 +83,7 @@ class SequenceWriter(ABC):
             FormatError: the array does not fit the field.
         """
 
-    def write_frames(self, frames: Mapping[int, Mapping[str, AnyArray]]) -> None:
+    def write_frames(self, frames: FrameArrays) -> None:
         """Write the fields of several frames, in the given order.
 
         `frames` maps frame numbers to fields by name, with the shapes of `write`.
@@ -115,6 +122,15 @@ class SequenceWriter(ABC):
         """
         return None
 
+    def cells_of(self, grid: str) -> int | None:
+        """Return the number of voxels of a grid from its params.json; None if it is not known."""
+        name = layout.params_file(grid)
+        data, where = self.read_document(name), f"{self.location}/{name}"
+        with suppress(FormatError):
+            if data is not None:
+                return math.prod(GridSpec.from_params(parse_json(data, where), where).size)
+        return None
+
     def remove_grid(self, grid: str) -> None:
         """Remove a grid.
 
@@ -136,12 +152,7 @@ class SequenceWriter(ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         if kind is None:
             self.close()
 
@@ -201,11 +212,6 @@ class Sink(ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         if kind is None:
             self.finish()

@@ -102,7 +102,10 @@ def test_velocities_come_back_bit_for_bit():
     with raises(FormatError, where="v.npz: voxel", expected="at most 2 values", found="3"):
         field.decode(data, "v.npz", (1, 1, 2))
     with raises(
-        FormatError, where="v.npz", expected="a table of voxel and velocity", found="float32"
+        FormatError,
+        where="v.npz",
+        expected="a table of velocities: voxel, velocity",
+        found="float32",
     ):
         field.encode(np.zeros((2, 4), np.float32), "v.npz")
 

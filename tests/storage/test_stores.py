@@ -386,7 +386,7 @@ def blosc_header(**changes: int) -> bytes:
 def refuse_chunk(data: bytes) -> None:
     out = np.full(100, 7, np.uint8)
     with pytest.raises(FormatError, match="its bytes: cannot be decoded"):
-        Encoding().decode(data, out, "zarr")
+        Encoding().decode(data, out)
     assert (out == 7).all()
 
 
@@ -404,19 +404,19 @@ def test_a_chunk_that_is_cut_short_is_refused() -> None:
     for size in (0, 15, len(whole) - 1):
         refuse_chunk(whole[:size])
     out = np.full(100, 7, np.uint8)
-    Encoding().decode(whole, out, "zarr")
+    Encoding().decode(whole, out)
     assert not out.any()
 
 
 def test_fewer_numbers_than_a_chunk_has_are_not_taken_for_all() -> None:
     pytest.importorskip("pcodec")
     encoding = Encoding("pcodec", 8)
-    data = encoding.encode(np.arange(50, dtype="<i4"), "zarr")
+    data = encoding.encode(np.arange(50, dtype="<i4"))
     for count in (49, 51):
         with pytest.raises(
             FormatError, match=r"its bytes: cannot be decoded: \d+ elements instead of"
         ):
-            encoding.decode(data, np.empty(count, "<i4"), "zarr")
+            encoding.decode(data, np.empty(count, "<i4"))
 
 
 def test_an_hdf5_store_shows_no_other_file(hdf5_store: Path, tmp_path: Path) -> None:

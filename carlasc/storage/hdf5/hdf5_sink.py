@@ -3,34 +3,29 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from carlasc.core.arrays import AnyArray
-from carlasc.errors import ArgumentError, import_extra
-from carlasc.storage import layout
-from carlasc.storage.files import sync_tree, unfinished
+from carlasc.errors import import_extra
+from carlasc.storage.files import AnyPath, sync_tree
 from carlasc.storage.hdf5.hdf5_source import CRC
 from carlasc.storage.packed.array_layout import (
     DOCUMENT,
     SEQUENCE,
     FieldLayout,
-    FrameTable,
-    count_elements,
     document_node,
     field_node,
-    number_arrays,
+    index_arrays,
     typical_size,
 )
 from carlasc.storage.packed.chunks import crc32c, in_threads
 from carlasc.storage.packed.columns import Column
-from carlasc.storage.packed.output import DeferredErrorFile, put_in_place, refuse_existing
+from carlasc.storage.packed.output import DeferredErrorFile, put_in_place
 from carlasc.storage.packed.stores import (
-    STORE,
     VERSION,
     FieldWriter,
     PackedSink,
@@ -43,99 +38,61 @@ _AHEAD = 16  # chunks that are encoded in parallel
 
 
 class HDF5Sink(PackedSink):
-    """Writes a packed HDF5 file. It gets its final name only when the sink is finished."""
+    """Writes a packed HDF5 file."""
 
     def __init__(
         self,
-        path: str | os.PathLike[str],
+        path: AnyPath,
         options: PackOptions | None = None,
         overwrite: bool = False,
     ) -> None:
-        """Start a file. The file of an interrupted run is removed.
+        """Start a file. The file of an interrupted run is removed, and is not continued.
 
         Raises:
-            ArgumentError: `small` is given, but HDF5 has no filter for PCodec.
+            ArgumentError: `small` is given.
             ConflictError: something exists at `path`, and `overwrite` is not given.
             DependencyError: h5py, hdf5plugin, numcodecs or google-crc32c is not installed.
         """
-        options = options or PackOptions()
-        if options.small:
-            raise ArgumentError(
-                "small",
-                expected="a .zarr store",
-                found=f"{path}: HDF5 has no PCodec filter",
-                advice="leave `small` out",
-            )
-        self.path = Path(path)
-        self.location = str(path)
-        self.options = options
-        self.overwrite = overwrite
-        refuse_existing(self.path, overwrite)
-        self._file = HDF5Output(unfinished(self.path), self.path)
-        self._sequences: dict[str, str] = {}
-
-    def finished(self, path: str) -> bool:
-        """Whether this run has completed the sequence. Interrupted runs are not continued."""
-        return path in self._sequences
+        super().__init__(path, options, overwrite)
+        self._file = HDF5Output(self.part, self.path)
 
     def sequence(self, path: str) -> HDF5Writer:
         """Start a sequence."""
-        group = node_of(path, self.location)
-        self._sequences.pop(path, None)
-        self._file.remove(group)
-        return HDF5Writer(self._file, path, group, self.options, self._sequences)
+        node = node_of(path, self.location)
+        self.nodes.pop(path, None)
+        self._file.remove(node)
+        return HDF5Writer(self, self._file, path, node)
 
     def finish(self, *, incomplete: bool = False) -> None:
         """Finish the store and give it its name."""
-        root = {"type": STORE, "version": VERSION, "complete": True, "sequences": self._sequences}
-        root |= {"lossy_mm": self.options.lossy_mm} if self.options.lossy_mm else {}
-        self._file.close(root)
-        sync_tree(self._file.path)
-        put_in_place(self._file.path, self.path, self.overwrite)
+        lossy = {"lossy_mm": self.options.lossy_mm} if self.options.lossy_mm else {}
+        self._file.close(self.root() | lossy)
+        sync_tree(self.part)
+        put_in_place(self.part, self.path, self.overwrite)
 
 
-class HDF5Writer(PackedWriter):
-    """Writes one sequence of a packed HDF5 file."""
+class HDF5Writer(PackedWriter["HDF5FieldWriter"]):
+    """Writes one sequence of a packed HDF5 file.
 
-    def __init__(
-        self,
-        output: HDF5Output,
-        path: str,
-        group: str,
-        options: PackOptions,
-        finished: dict[str, str],
-    ) -> None:
-        super().__init__(f"{output.location}/{group}", path)
+    Attributes:
+        rows: number of elements of a typical frame, by field.
+    """
+
+    def __init__(self, sink: HDF5Sink, output: HDF5Output, path: str, node: str) -> None:
+        super().__init__(sink, path, node)
+        self.rows: dict[str, int] = {}
         self._output = output
-        self._group = group
-        self._options = options
-        self._finished = finished
-        self._rows: dict[str, int] = {}
-        self._fields: dict[str, HDF5FieldWriter] = {}
 
     def expect(
         self, frames: Mapping[str, Iterable[int]], rows: Mapping[str, int] | None = None
     ) -> None:
         """Record the size of a typical frame, which determines the size of chunks."""
-        self._rows.update(rows or {})
+        self.rows.update(rows or {})
 
-    def _start_field(self, field: str) -> FieldWriter:
-        entry = layout.field_named(field)
+    def _start_field(self, field: str) -> HDF5FieldWriter:
+        return HDF5FieldWriter(self, self._output, field)
 
-        def plan(arrays: list[AnyArray]) -> FieldLayout:
-            return FieldLayout.plan(
-                field, self._options, typical_size(entry, arrays, self._rows, self.read_document)
-            )
-
-        self._fields[field] = HDF5FieldWriter(
-            self._output, f"{self._group}/{field_node(field)}", field, plan
-        )
-        return self._fields[field]
-
-    def close(self) -> None:
-        """Write buffered frames and mark the sequence as complete."""
-        for field in self._fields.values():
-            field.close()
+    def _finish(self) -> None:
         for name, data in self.contents.items():
             attributes = {
                 "type": DOCUMENT,
@@ -145,55 +102,36 @@ class HDF5Writer(PackedWriter):
                 "name": name,
             }
             self._output.write_small(
-                f"{self._group}/{document_node(name)}", np.frombuffer(data, np.uint8), attributes
+                f"{self.node}/{document_node(name)}", np.frombuffer(data, np.uint8), attributes
             )
-        layouts = {name: field.layout for name, field in self._fields.items()}
-        frames, counts, columns = count_elements(
-            layouts, {name: one.table for name, one in self._fields.items()}
-        )
-        about = {"version": VERSION, "dtype": "int64"}
-        self._output.write_small(
-            f"{self._group}/frames", frames, about | {"type": "carlasc.frames", "unit": "frame"}
-        )
-        about |= {"type": "carlasc.counts", "unit": "element", "columns": columns}
-        self._output.write_small(f"{self._group}/counts", counts, about)
-        for name, numbers, attributes in number_arrays(self.read_document):
-            self._output.write_small(f"{self._group}/{name}", numbers, attributes)
-        self._output.write_group(
-            self._group, {"type": SEQUENCE, "version": VERSION, **self.about()}
-        )
-        self._finished[self.path] = self._group
+        layouts = {name: field.layout for name, field in self.writers.items()}
+        tables = {name: field.frames for name, field in self.writers.items()}
+        for name, values, attributes in index_arrays(layouts, tables, self.read_document):
+            self._output.write_small(f"{self.node}/{name}", values, attributes)
+        self._output.write_group(self.node, {"type": SEQUENCE, "version": VERSION, **self.about()})
 
 
 class HDF5FieldWriter(FieldWriter):
     """Writes the columns of a field.
 
     Attributes:
-        table: the frames written so far.
         layout: layout of the field, determined by the first frame that is not empty.
     """
 
     layout: FieldLayout
 
-    def __init__(
-        self,
-        output: HDF5Output,
-        node: str,
-        field: str,
-        plan: Callable[[list[AnyArray]], FieldLayout],
-    ) -> None:
+    def __init__(self, writer: HDF5Writer, output: HDF5Output, field: str) -> None:
         super().__init__(field)
-        self.table: FrameTable = {}
+        self._writer = writer
         self._output = output
-        self._node = node
-        self._plan = plan
+        self._node = f"{writer.node}/{field_node(field)}"
         self._planned = False
         self._columns: dict[str, HDF5ColumnWriter] = {}
 
-    def write(self, frame: int, array: AnyArray) -> None:
+    def write(self, frame: int, array: AnyArray) -> dict[str, int]:
         """Divide one frame into chunks. Chunks of several frames are written together."""
         if not self._planned and array.size:
-            self.layout, self._planned = self._plan([array]), True
+            self._plan([array])
         counts, parts = self.layout.divide(array, limited=False) if self._planned else ({}, {})
         for name, chunks in parts.items():
             if name not in self._columns:
@@ -201,15 +139,21 @@ class HDF5FieldWriter(FieldWriter):
                     self._output, f"{self._node}/{name}", self.layout, name
                 )
             self._columns[name].append(frame, chunks)
-        self.table[frame] = counts
+        return counts
 
     def close(self) -> None:
         """Write buffered frames, and the group of the field."""
         if not self._planned:
-            self.layout = self._plan([])
+            self._plan([])
         for column in self._columns.values():
-            column.close(max(self.table) + 1)
+            column.close(max(self.frames) + 1)
         self._output.write_group(self._node, dict(self.layout.attributes))
+
+    def _plan(self, arrays: list[AnyArray]) -> None:
+        writer = self._writer
+        typical = typical_size(self.entry, arrays, writer.rows, writer.cells_of)
+        self.layout = FieldLayout.plan(self.entry.name, writer.options, typical)
+        self._planned = True
 
 
 class HDF5ColumnWriter:
@@ -243,14 +187,14 @@ class HDF5ColumnWriter:
     def _flush(self) -> None:
         if not self._held:
             return
-        encoded = in_threads(lambda one: self._encoding.encode(one[2], "hdf5"), self._held)
+        encoded = in_threads(lambda one: self._encoding.encode(one[2]), self._held)
         step, shape = self._dataset.chunks[-1], self._dataset.shape
         needed = (max(number for _, number, _ in self._held) + 1) * step
         self._dataset.resize((self._held[-1][0] + 1, *shape[1:-1], max(shape[-1], needed)))
         for (frame, number, _), data in zip(self._held, encoded, strict=True):
             offset = (frame, *[0] * (len(shape) - 2), number * step)
             self._dataset.id.write_direct_chunk(offset, data)
-            self._checksums.append(crc32c(data, "hdf5"))
+            self._checksums.append(crc32c(data))
         self._held = []
         self._output.check()
 
@@ -266,8 +210,6 @@ class HDF5Output:
         self._filters = import_extra("hdf5plugin", "hdf5")
         for module in ("numcodecs", "google_crc32c"):
             import_extra(module, "hdf5")
-        self.location = str(path)
-        self.path = path
         self._output = DeferredErrorFile(path, place)
         self._file = h5py.File(self._output, "w", libver=("v110", "v110"), track_order=False)
         self.check()
@@ -283,7 +225,6 @@ class HDF5Output:
 
     def write_small(self, node: str, array: AnyArray, attributes: dict[str, Any]) -> None:
         """Write a data set of one chunk."""
-        self.remove(node)
         compact = (
             {"chunks": array.shape, "shuffle": True, "compression": "gzip", "fletcher32": True}
             if array.size
@@ -313,9 +254,8 @@ class HDF5Output:
 
     def remove(self, node: str) -> None:
         """Remove a node. The file reuses its space."""
-        for name in (node, node + CRC):
-            if name in self._file:
-                del self._file[name]
+        if node in self._file:
+            del self._file[node]
 
     def close(self, attributes: dict[str, Any]) -> None:
         """Write the root's attributes and close the file."""
@@ -326,15 +266,13 @@ class HDF5Output:
 
 
 def _write_attributes(node: Any, attributes: dict[str, Any]) -> None:
-    """Replace the attributes of a node.
+    """Write the attributes of a new node.
 
     Text and numbers are written unchanged, other values as JSON under `<name>:json`.
 
     Text has a fixed length. HDF5 stores text of variable length in global heaps, the only structure
     of a file without a checksum. If a heap is damaged by a few zeros, HDF5 2.0 hangs.
     """
-    for name in list(node.attrs):
-        del node.attrs[name]
     for name, value in attributes.items():
         if isinstance(value, int | float):
             node.attrs[name] = value

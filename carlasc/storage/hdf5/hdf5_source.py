@@ -9,6 +9,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -117,15 +118,19 @@ class HDF5Store(ArrayStore):
                     yield file
 
 
+@dataclass(eq=False)
 class HDF5Array(StoredArray):
-    """A chunked data set with the Blosc filter, and the offset and the checksum of each existing
-    chunk.
+    """A chunked data set with the Blosc filter.
+
+    Attributes:
+        path: the HDF5 file.
+        places: the first byte and the end of each existing chunk.
+        checksums: the checksum of each existing chunk.
     """
 
-    extra = "hdf5"
-    _path: str
-    _places: dict[int, tuple[int, int]]
-    _checksums: dict[int, int]
+    path: str
+    places: dict[int, tuple[int, int]]
+    checksums: dict[int, int]
 
     @classmethod
     def from_dataset(cls, tree: Tree, path: str, dataset: Any, checksums: Uint32Array) -> HDF5Array:
@@ -150,7 +155,6 @@ class HDF5Array(StoredArray):
             raise damaged(
                 where, "a chunked data set with the Blosc filter", "other filters or no chunks"
             )
-        array = cls(tree, dataset.name, dataset.dtype, shape, chunk, Encoding())
         rooms = [-(-n // step) for n, step in zip(shape, chunk, strict=True)]
         places: dict[int, tuple[int, int]] = {}
 
@@ -163,24 +167,24 @@ class HDF5Array(StoredArray):
         dataset.id.chunk_iter(note)
         if len(places) != len(checksums):
             raise damaged(where, f"{len(checksums)} chunks", str(len(places)))
-        array._path, array._places = path, places
-        array._checksums = dict(zip(sorted(places), checksums.tolist(), strict=True))
-        return array
+        sums = dict(zip(sorted(places), checksums.tolist(), strict=True))
+        about = (dataset.name, dataset.dtype, shape, chunk, Encoding())
+        return cls(tree, *about, path, places, sums)
 
     def locate(self, numbers: Sequence[int]) -> list[tuple[str, int, int]]:
         """Return the file, the first byte and the end of each chunk."""
         for number in numbers:
-            if number not in self._places:
-                raise damaged(self.tree.where(self._path), f"chunk {number} of {self.name}", "none")
-        return [(self._path, *self._places[number]) for number in numbers]
+            if number not in self.places:
+                raise damaged(self.tree.where(self.path), f"chunk {number} of {self.name}", "none")
+        return [(self.path, *self.places[number]) for number in numbers]
 
     def files(self, numbers: Sequence[int]) -> list[str]:
         """Return the HDF5 file."""
-        return [self._path]
+        return [self.path]
 
     def verify(self, data: memoryview, number: int) -> memoryview:
         """Compare a chunk with the data set of checksums."""
-        if crc32c(data, "hdf5") != self._checksums[number]:
+        if crc32c(data) != self.checksums[number]:
             raise FormatError(
                 f"chunk {number} of {self.name}",
                 problem="the checksum does not match",
@@ -212,19 +216,11 @@ def find_node(file: Any, node: str, where: str) -> Any:
                 if isinstance(link, h5py.ExternalLink)
                 else "a symbolic link"
             )
-            raise FormatError(
-                f"{where}: {node}",
-                expected="data in the file itself",
-                found=kind,
-                advice=_UNTRUSTED,
-            )
+            raise damaged(f"{where}: {node}", "data in the file itself", kind, _UNTRUSTED)
         place = place[name]
     if isinstance(place, h5py.Dataset) and (place.is_virtual or place.external):
-        raise FormatError(
-            f"{where}: {node}",
-            expected="values in the file itself",
-            found="values in other files",
-            advice=_UNTRUSTED,
+        raise damaged(
+            f"{where}: {node}", "values in the file itself", "values in other files", _UNTRUSTED
         )
     return place
 
@@ -242,12 +238,7 @@ def check_small(dataset: Any, what: str) -> None:
         _filters(dataset),
     )
     if dataset.dtype.kind not in "uif" or not set(filters) <= _SMALL_FILTERS:
-        raise FormatError(
-            what,
-            expected="numbers without filters or with gzip",
-            found="other data",
-            advice=_UNTRUSTED,
-        )
+        raise damaged(what, "numbers without filters or with gzip", "other data", _UNTRUSTED)
     check_ratio(size, stored, what)
     if dataset.chunks is None or not size:
         if size > stored:  # HDF5 would fill the rest with zeros
@@ -259,9 +250,7 @@ def check_small(dataset: Any, what: str) -> None:
         packed = dataset.id.read_direct_chunk((0,) * len(dataset.shape))[1]
         unpacked = zlib.decompressobj().decompress(packed, size + 1)
         if len(unpacked) != size:
-            raise FormatError(
-                what, expected=f"{size} bytes", found="another size", advice=_UNTRUSTED
-            )
+            raise damaged(what, f"{size} bytes", "another size", _UNTRUSTED)
 
 
 def _filters(dataset: Any) -> list[int]:

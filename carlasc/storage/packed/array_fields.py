@@ -13,7 +13,7 @@ from typing import cast
 import numpy as np
 
 from carlasc.core.arrays import AnyArray, Float32Array, IntArray
-from carlasc.errors import FormatError, MissingDataError, reading
+from carlasc.errors import MissingDataError, reading, within
 from carlasc.storage.arrays import check_size
 from carlasc.storage.packed.array_layout import FieldLayout
 from carlasc.storage.packed.chunks import StoredArray, parallel, scratch
@@ -68,9 +68,9 @@ class ArrayField:
             self.layout.check(
                 array, column, int(self.frames[-1]), int(counts.max()), f"{self.where}/{name}"
             )
-            firsts = self.frames * array.slots
+            firsts, elements = self.frames * array.slots, np.maximum(counts, 0)
             columns[name] = StoredColumn(
-                column, array, firsts, np.maximum(counts, 0), self.layout.is_grid
+                column, array, firsts.tolist(), elements.tolist(), self.layout.is_grid
             )
         return columns
 
@@ -161,11 +161,8 @@ class ArrayField:
         where = (
             f"{self.where}: field {self.packing.entry.name}, frame {', '.join(map(str, frames))}"
         )
-        with reading(where, "the columns of a frame", "the store is damaged"):
-            try:
-                yield
-            except FormatError as error:
-                raise error.within(where) from error
+        with reading(where, "the columns of a frame", "the store is damaged"), within(where):
+            yield
 
     def _position(self, frame: int) -> int:
         if frame not in self._positions:
@@ -190,6 +187,7 @@ class FramePart:
     fetched: list[memoryview] | None = None
 
 
+@dataclass(eq=False)
 class StoredColumn:
     """One array of a field, and the chunks of each frame in it.
 
@@ -199,21 +197,14 @@ class StoredColumn:
         firsts: number of the first chunk of each frame.
         counts: number of elements of each frame; for a grid, a number above 0 means that the frame
             exists.
+        is_grid: whether the field has one value per voxel.
     """
 
-    def __init__(
-        self,
-        column: Column,
-        array: StoredArray,
-        firsts: IntArray,
-        counts: IntArray,
-        is_grid: bool,
-    ) -> None:
-        self.column = column
-        self.array = array
-        self.is_grid = is_grid
-        self.firsts: list[int] = firsts.tolist()
-        self.counts: list[int] = counts.tolist()
+    column: Column
+    array: StoredArray
+    firsts: list[int]
+    counts: list[int]
+    is_grid: bool
 
     def parts(self, positions: list[int]) -> list[FramePart]:
         """Return the parts that hold some frames."""

@@ -8,21 +8,19 @@ block of frames can therefore be written independently of the others, and found 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-from carlasc.core.arrays import AnyArray, IntArray
-from carlasc.core.grids import GridSpec
+from carlasc.core.arrays import AnyArray
 from carlasc.errors import FormatError
 from carlasc.storage import field_files, layout
-from carlasc.storage.files import damaged, parse_json
+from carlasc.storage.files import damaged
 from carlasc.storage.packed.chunks import StoredArray
 from carlasc.storage.packed.columns import FEW, LEAST, Column, Packing, packing_of
-from carlasc.storage.packed.stores import VERSION, PackOptions
+from carlasc.storage.packed.stores import VERSION, PackOptions, check_scale
 
 SEQUENCE, FIELD, COLUMN, DOCUMENT = (
     "carlasc.sequence",
@@ -72,9 +70,7 @@ class FieldLayout:
         """
         if attributes is None or attributes.get("type") != FIELD:
             raise damaged(where, "the field that the sequence lists", "none")
-        scale = attributes.get("scale_m")
-        if scale is not None and not (type(scale) in (int, float) and 0 < scale <= 1):
-            raise damaged(where, "a step of coordinates above 0, up to 1 m", repr(scale))
+        check_scale(attributes, where)
         options = PackOptions(small=attributes.get("codec") == _PCODEC)
         packing = packing_of(layout.field_named(field), options, attributes)
         if attributes.get("kind") != packing.kind:
@@ -106,8 +102,11 @@ class FieldLayout:
             size: dict[str, Any] = {"shape": list(typical)}
         else:
             size = {"chunk": max(_round_up(int(typical[0] * _HEADROOM)), LEAST)}
-        about = {"type": FIELD, "version": VERSION, "field": entry.name, "kind": packing.kind}
-        about |= {
+        about = {
+            "type": FIELD,
+            "version": VERSION,
+            "field": entry.name,
+            "kind": packing.kind,
             "dtype": np.dtype(entry.dtype).name if entry.dtype else "table",
             "unit": entry.unit,
         }
@@ -246,7 +245,7 @@ def typical_size(
     entry: field_files.Field,
     arrays: list[AnyArray],
     rows: Mapping[str, int],
-    read_document: Callable[[str], bytes | None],
+    cells_of: Callable[[str], int | None],
 ) -> tuple[int, ...]:
     """Return the typical size of a new field, for `FieldLayout.plan`.
 
@@ -254,7 +253,7 @@ def typical_size(
         entry: the field.
         arrays: the first frames.
         rows: the announced number of elements of a typical frame, by field.
-        read_document: returns a text file of the sequence, None if it does not exist.
+        cells_of: returns the number of voxels of a grid, None if it is not known.
 
     Returns:
         The shape of a grid, or (number of elements of a typical frame,): as announced, otherwise
@@ -265,7 +264,7 @@ def typical_size(
     announced = rows.get("points") if entry.per == "point" else None
     announced = rows.get(entry.name) if announced is None else announced
     if announced is None and entry.per in _CELLS_PER_ROW:
-        announced = _cells(entry.folder, read_document) // _CELLS_PER_ROW[entry.per]
+        announced = (cells_of(entry.folder) or 0) // _CELLS_PER_ROW[entry.per]
     if announced is None:
         announced = max(map(len, arrays), default=0)
         announced = (
@@ -276,31 +275,21 @@ def typical_size(
     return (announced,)
 
 
-def _cells(grid: str, read_document: Callable[[str], bytes | None]) -> int:
-    """Return the number of voxels of a grid; 0 if it is not known."""
-    data = read_document(layout.params_file(grid))
-    try:
-        return (
-            0
-            if data is None
-            else math.prod(GridSpec.from_params(parse_json(data, grid), grid).size)
-        )
-    except FormatError:
-        return 0
+def index_arrays(
+    layouts: Mapping[str, FieldLayout],
+    tables: Mapping[str, FrameTable],
+    read_document: Callable[[str], bytes | None],
+) -> Iterator[tuple[str, AnyArray, dict[str, Any]]]:
+    """Yield the arrays of a sequence beside its fields: name, values and attributes.
 
-
-def count_elements(
-    layouts: Mapping[str, FieldLayout], tables: Mapping[str, FrameTable]
-) -> tuple[IntArray, IntArray, list[str]]:
-    """Return the arrays `frames` and `counts` of a sequence, which readers use to find frames.
+    `frames` has the (N,) sorted frame numbers. `counts` has the (N, C) number of elements per frame
+    and column, -1 if the field lacks the frame, and the nodes of the C columns; readers find frames
+    by it. `poses` and `times` are for programs that do not read the text files.
 
     Args:
         layouts: the layout of each field.
-        tables: the frames of each field, at least one.
-
-    Returns:
-        frames: (N,) sorted frame numbers; counts: (N, C) number of elements per frame and column,
-        -1 if the field lacks the frame; and the nodes of the C columns.
+        tables: the frames of each field.
+        read_document: returns a text file of the sequence, None if it does not exist.
     """
     frames = sorted({frame for table in tables.values() for frame in table})
     columns: dict[str, list[int]] = {}
@@ -311,29 +300,19 @@ def count_elements(
             if max(counts) > 0 or column in firsts:
                 columns[f"{field_node(name)}/{column}"] = counts
     counts_of = np.array(list(columns.values()), "<i8").reshape(len(columns), len(frames)).T
-    return np.array(frames, "<i8"), np.ascontiguousarray(counts_of), list(columns)
-
-
-def number_arrays(
-    read_document: Callable[[str], bytes | None],
-) -> Iterator[tuple[str, AnyArray, dict[str, Any]]]:
-    """Yield poses and times as arrays, for programs that do not read the text files: name, values
-    and attributes.
-    """
+    about = {"version": VERSION, "dtype": "int64"}
+    yield "frames", np.array(frames, "<i8"), about | {"type": "carlasc.frames", "unit": "frame"}
+    about |= {"type": "carlasc.counts", "unit": "element", "columns": list(columns)}
+    yield "counts", np.ascontiguousarray(counts_of), about
     for name, document, decode, unit in (
         ("poses", layout.POSES, layout.decode_poses, "m"),
         ("times", layout.TIMES, layout.decode_times, "s"),
     ):
         data = read_document(document)
+        about = {"type": "carlasc.numbers", "version": VERSION, "dtype": "float64", "unit": unit}
         # not numbers: the text is kept unchanged, and its reader reports the error
         with suppress(FormatError):
             if data is not None:
-                about = {
-                    "type": "carlasc.numbers",
-                    "version": VERSION,
-                    "dtype": "float64",
-                    "unit": unit,
-                }
                 yield name, decode(data, document), about | {"document": document}
 
 

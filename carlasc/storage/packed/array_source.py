@@ -18,7 +18,6 @@ from carlasc.storage.packed.array_fields import ArrayField
 from carlasc.storage.packed.array_layout import SEQUENCE, FieldLayout, document_node, field_node
 from carlasc.storage.packed.chunks import StoredArray
 from carlasc.storage.packed.stores import PackedSequence, PackedSource
-from carlasc.storage.protocol import Sequence
 from carlasc.storage.transport.trees import Tree
 
 _T = TypeVar("_T")
@@ -74,17 +73,14 @@ class ArraySource(PackedSource):
         super().__init__(store.location, store.attributes(""))
         self.store = store
 
-    def sequences(self) -> Mapping[str, Sequence]:
+    def sequences(self) -> Mapping[str, ArraySequence]:
         """Return the sequences that the store lists."""
-        return self._sequences()
-
-    def _sequences(self) -> dict[str, ArraySequence]:
         return {path: ArraySequence(self.store, path, group) for path, group in self.nodes.items()}
 
     def published_bytes(self) -> dict[str, int]:
         """Return the size of the published files by field, from the numbers of elements."""
         sizes: Counter[str] = Counter()
-        for sequence in self._sequences().values():
+        for sequence in self.sequences().values():
             sizes["documents"] += sum(
                 len(sequence.read_document(name)) for name in sequence.documents()
             )
@@ -92,15 +88,9 @@ class ArraySource(PackedSource):
                 sizes[field] += sequence.published_bytes(field)
         return dict(sizes)
 
-    def stored_bytes(self) -> dict[str, int]:
-        """Return the stored bytes by field."""
-        sizes: Counter[str] = Counter()
-        for path, sequence in self.sequences().items():
-            group = self.nodes[path]
-            sizes["documents"] += self.store.stored_bytes(f"{group}/documents")
-            for field in sequence.fields():
-                sizes[field] += self.store.stored_bytes(f"{group}/{field_node(field)}")
-        return dict(sizes) | {"index": self.store.stored_bytes("") - sizes.total()}
+    def _stored_bytes(self, group: str, name: str) -> int:
+        node = name if name == "documents" else field_node(name)
+        return self.store.stored_bytes(f"{group}/{node}" if group else "")
 
 
 class ArraySequence(PackedSequence[ArrayField]):
@@ -126,7 +116,7 @@ class ArraySequence(PackedSequence[ArrayField]):
 
     def read(self, field: str, frame: int) -> AnyArray:
         """Read one field of one frame."""
-        return self._read_again(lambda: self._field(field).read([frame])[0])
+        return self.read_many(field, [frame])[0]
 
     def read_many(self, field: str, frames: Iterable[int]) -> list[AnyArray]:
         """Read several frames. They are fetched together and decoded in parallel."""
@@ -145,7 +135,7 @@ class ArraySequence(PackedSequence[ArrayField]):
 
     def read_document(self, name: str) -> bytes:
         """Return a text file's bytes."""
-        self._check_document(name)
+        self._check_listed("text file", self._documents, name)
         return self.store.read_document(f"{self.group}/{document_node(name)}")
 
     def files_of(self, field: str, frames: Iterable[int]) -> list[str]:

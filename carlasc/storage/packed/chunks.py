@@ -13,10 +13,11 @@ import multiprocessing
 import os
 import struct
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -27,6 +28,8 @@ from carlasc.running import count_cores
 from carlasc.storage.arrays import check_size
 from carlasc.storage.transport.trees import Tree
 
+# opening an HDF5 store checks that its own extra is installed; only zarr has PCodec
+_EXTRA = "zarr"
 _T = TypeVar("_T")
 _R = TypeVar("_R")
 
@@ -50,16 +53,16 @@ class Encoding:
     level: int = 5
     shuffle: int = NO_SHUFFLE
 
-    def encode(self, chunk: AnyArray, extra: str) -> bytes:
+    def encode(self, chunk: AnyArray) -> bytes:
         """Return the encoded bytes of a chunk, without the checksum."""
         if self.codec == "pcodec":
-            return bytes(_pcodec(self.level, extra).encode(np.ascontiguousarray(chunk).reshape(-1)))
-        blosc = import_extra("numcodecs.blosc", extra)
+            return bytes(_pcodec(self.level).encode(np.ascontiguousarray(chunk).reshape(-1)))
+        blosc = import_extra("numcodecs.blosc", _EXTRA)
         return bytes(
             blosc.compress(np.ascontiguousarray(chunk), b"zstd", self.level, self.shuffle, BLOCK)
         )
 
-    def decode(self, data: bytes | memoryview, out: AnyArray, extra: str) -> None:
+    def decode(self, data: bytes | memoryview, out: AnyArray) -> None:
         """Decode the bytes of a chunk into `out`, a contiguous array with the shape and dtype of
         the chunk.
 
@@ -71,14 +74,14 @@ class Encoding:
                 # numcodecs does not report the number of decoded values: with too few, the rest of
                 # `out` would be unset. PCodec before 1.1 has `standalone` as a module alone, not as
                 # an attribute of the package.
-                progress = import_extra("pcodec.standalone", extra).simple_decompress_into(
+                progress = import_extra("pcodec.standalone", _EXTRA).simple_decompress_into(
                     bytes(data), out.reshape(-1)
                 )
                 if progress.n_processed != out.size or not progress.finished:
                     raise ValueError(f"{progress.n_processed} elements instead of {out.size}")
             else:
                 _check_blosc(data, out.nbytes)
-                import_extra("numcodecs.blosc", extra).decompress(data, out)
+                import_extra("numcodecs.blosc", _EXTRA).decompress(data, out)
         except (CarlascError, KeyboardInterrupt, SystemExit):
             raise
         except (
@@ -111,11 +114,12 @@ def _check_blosc(data: bytes | memoryview, size: int) -> None:
 
 
 @cache
-def _pcodec(level: int, extra: str) -> Any:
-    return import_extra("numcodecs.pcodec", extra).PCodec(level=level)
+def _pcodec(level: int) -> Any:
+    return import_extra("numcodecs.pcodec", _EXTRA).PCodec(level=level)
 
 
-class StoredArray:
+@dataclass(eq=False)
+class StoredArray(ABC):
     """A chunked array of a store.
 
     Chunks are numbered in C order. The array of a column has one entry per frame along its first
@@ -128,48 +132,41 @@ class StoredArray:
         shape: shape of the whole array.
         chunk: shape of a chunk.
         encoding: how chunks are encoded.
-        slots: number of chunks per entry of the first axis.
     """
 
-    extra = "zarr"
+    tree: Tree
+    name: str
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    chunk: tuple[int, ...]
+    encoding: Encoding
 
-    def __init__(
-        self,
-        tree: Tree,
-        name: str,
-        dtype: np.dtype[Any],
-        shape: tuple[int, ...],
-        chunk: tuple[int, ...],
-        encoding: Encoding,
-    ) -> None:
-        self.tree = tree
-        self.name = name
-        self.dtype = dtype
-        self.shape = shape
-        self.chunk = chunk
-        self.encoding = encoding
-        self.slots = math.prod(-(-n // step) for n, step in zip(shape[1:], chunk[1:], strict=True))
+    @cached_property
+    def slots(self) -> int:
+        """Number of chunks per entry of the first axis."""
+        rest = zip(self.shape[1:], self.chunk[1:], strict=True)
+        return math.prod(-(-n // step) for n, step in rest)
 
     @property
     def step(self) -> int:
         """Length of a chunk along the last axis."""
         return self.chunk[-1]
 
+    @abstractmethod
     def locate(self, numbers: Sequence[int]) -> list[tuple[str, int, int]]:
         """Return the file, the first byte and the end of each chunk."""
-        raise NotImplementedError
 
+    @abstractmethod
     def files(self, numbers: Sequence[int]) -> list[str]:
         """Return the files that hold some chunks, each once."""
-        raise NotImplementedError
 
+    @abstractmethod
     def verify(self, data: memoryview, number: int) -> memoryview:
         """Verify the checksum of a chunk, and return its encoded bytes without it.
 
         Raises:
             FormatError: the checksum does not match.
         """
-        raise NotImplementedError
 
     def fetch(self, numbers: Sequence[int]) -> list[memoryview]:
         """Read encoded chunks; all at once from a remote store."""
@@ -177,7 +174,7 @@ class StoredArray:
 
     def decode(self, data: memoryview, number: int, out: AnyArray) -> None:
         """Verify a fetched chunk and decode it into `out`."""
-        self.encoding.decode(self.verify(data, number), out, self.extra)
+        self.encoding.decode(self.verify(data, number), out)
 
     def read_chunk(self, number: int) -> AnyArray:
         """Fetch, verify and decode one chunk."""
@@ -212,7 +209,7 @@ def in_threads(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
     return list(results)
 
 
-def crc32c(data: bytes | memoryview, extra: str) -> int:
+def crc32c(data: bytes | memoryview) -> int:
     """Return the CRC-32C of some bytes.
 
     CPUs have an instruction for it, which makes it six times as fast as CRC-32.
@@ -220,7 +217,7 @@ def crc32c(data: bytes | memoryview, extra: str) -> int:
     source = data.obj if isinstance(data, memoryview) else data
     # the library takes bytes only
     whole = source if isinstance(source, bytes) and len(source) == len(data) else bytes(data)
-    return int(import_extra("google_crc32c", extra).value(whole))
+    return int(import_extra("google_crc32c", _EXTRA).value(whole))
 
 
 def scratch(shape: tuple[int, ...], dtype: np.dtype[Any]) -> AnyArray:

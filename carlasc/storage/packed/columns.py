@@ -17,6 +17,7 @@ from carlasc.core.arrays import AnyArray, Float32Array, Int32Array
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError
 from carlasc.storage import field_files
+from carlasc.storage.files import damaged
 from carlasc.storage.packed.chunks import BITSHUFFLE, NO_SHUFFLE, SHUFFLE, Encoding
 from carlasc.storage.packed.stores import PackOptions
 
@@ -25,12 +26,16 @@ _PCODEC_STEP = 8192
 LEAST = 1 << 14  # minimum number of elements per chunk
 FEW = 256  # minimum for boxes, and for the distinct vectors of a flow
 WIDE = "_wide"  # suffix of the name of a wide column
-_GEOMETRY = tuple(name for name in BOXES_DTYPE.names or () if BOXES_DTYPE[name].kind == "f")
+# a box in memory, with its ten real numbers as one column
+_STORED_BOX = np.dtype(
+    [("track", "<u4"), ("label", "<u4"), ("geometry", "<f8", (10,)), ("annotated", "u1")]
+)
 # narrow and wide type of grids, by the published type
 _WIDE_CELLS = {
     "<u4": ("u1", "<u4"),
     "<f4": ("<u2", "<f4"),
 }
+_SHUFFLED = Encoding(shuffle=SHUFFLE)  # of nearly all columns
 Columns = dict[str, AnyArray]
 
 
@@ -113,8 +118,7 @@ class Packing(ABC):
         """
         main = self.columns[0].name
         elements = counts.get(main, 0) + counts.get(f"{main}{WIDE}", 0)
-        row = np.dtype(self.entry.dtype or BOXES_DTYPE).itemsize * (self.entry.columns or 1)
-        return elements * row
+        return elements * self.entry.row_bytes
 
     def allocate(self, counts: list[int]) -> list[AnyArray | None]:
         """Return one array per frame, of `counts` elements, for `join` to write to; None if `join`
@@ -131,7 +135,7 @@ class PointsPacking(Packing):
     kind = "points"
 
     def _columns(self, options: PackOptions) -> tuple[Column, ...]:
-        encoding = Encoding("pcodec", 8) if options.small else Encoding(shuffle=SHUFFLE)
+        encoding = Encoding("pcodec", 8) if options.small else _SHUFFLED
         scale = self.attributes.get("scale_m")
         dtype, unit = ("<i4", f"{scale} m") if scale else ("<f4", "m")
         return (
@@ -187,7 +191,7 @@ class ValuesPacking(Packing):
 
     def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         incompressible = self.entry.kind == "picture"
-        encoding = Encoding(level=1) if incompressible else Encoding(shuffle=SHUFFLE)
+        encoding = Encoding(level=1) if incompressible else _SHUFFLED
         dtype, wide = ("u1", "<u4") if self.entry.kind == "class" else (self.entry.dtype, None)
         return (Column("values", dtype, encoding, self.entry.unit, wide=wide),)
 
@@ -214,11 +218,7 @@ class PairsPacking(Packing):
 
     def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         rows = self.entry.columns
-        return (
-            Column(
-                "values", self.entry.dtype, Encoding(shuffle=SHUFFLE), self.entry.unit, rows=rows
-            ),
-        )
+        return (Column("values", self.entry.dtype, _SHUFFLED, self.entry.unit, rows=rows),)
 
     def split(self, array: AnyArray) -> Columns:
         """Return the columns as planes."""
@@ -237,9 +237,8 @@ class FlowPacking(Packing):
     kind = "flow"
 
     def _columns(self, options: PackOptions) -> tuple[Column, ...]:
-        encoding = Encoding(shuffle=SHUFFLE)
-        return Column("index", "u1", encoding, wide="<u4"), Column(
-            "palette", "<f4", encoding, self.entry.unit, rows=3, least=FEW, wide="<f4"
+        return Column("index", "u1", _SHUFFLED, wide="<u4"), Column(
+            "palette", "<f4", _SHUFFLED, self.entry.unit, rows=3, least=FEW, wide="<f4"
         )
 
     def split(self, array: AnyArray) -> Columns:
@@ -258,13 +257,7 @@ class FlowPacking(Packing):
         """Return (N, 3) float32."""
         index, palette = columns["index"], columns["palette"]
         if index.size and int(index.max()) >= palette.shape[1]:
-            found, advice = str(int(index.max())), "the store is damaged"
-            raise FormatError(
-                "its index",
-                expected=f"indices below {palette.shape[1]}",
-                found=found,
-                advice=advice,
-            )
+            raise damaged("its index", f"indices below {palette.shape[1]}", str(int(index.max())))
         return np.ascontiguousarray(palette.T)[index]
 
 
@@ -297,97 +290,88 @@ class GridPacking(Packing):
         return columns["values"]
 
 
-class VotesPacking(Packing):
-    """Votes or probabilities by class: the columns of the table: `voxel`, `label`, `votes`."""
+class TablePacking(Packing):
+    """A table: its columns, of which those of several numbers are stored as planes (K, N).
 
-    kind = "votes"
+    Attributes:
+        tables: the types of a row, with one-byte and with wide labels.
+    """
 
-    def _columns(self, options: PackOptions) -> tuple[Column, ...]:
-        return (
-            Column("voxel", "<i4", Encoding(shuffle=SHUFFLE), "index"),
-            Column("label", "u1", Encoding(), "class", wide="<u2"),
-            Column("votes", "<u2", Encoding(shuffle=SHUFFLE), self.entry.unit),
-        )
+    tables: ClassVar[tuple[np.dtype[Any], ...]]
 
     def published_bytes(self, counts: Mapping[str, int]) -> int:
         """Return the bytes of tables with this many rows."""
-        wide = counts.get(f"label{WIDE}", 0)
-        narrow_rows = counts.get("voxel", 0) - wide
-        return (
-            narrow_rows * field_files.VOTES_DTYPE.itemsize
-            + wide * field_files.WIDE_VOTES_DTYPE.itemsize
+        columns = [column for family in self.columns for column in family.both]
+        return sum(
+            counts.get(one.name, 0) * np.dtype(one.dtype).itemsize * (one.rows or 1)
+            for one in columns
         )
 
     def split(self, array: AnyArray) -> Columns:
         """Return the columns of the table."""
-        return {column.name: np.ascontiguousarray(array[column.name]) for column in self.columns}
+        return {column.name: np.ascontiguousarray(array[column.name].T) for column in self.columns}
 
     def join(self, columns: Columns, into: AnyArray | None = None) -> AnyArray:
         """Return the table."""
-        wide = columns["label"].dtype.itemsize > 1
-        votes = np.empty(
-            len(columns["voxel"]), field_files.WIDE_VOTES_DTYPE if wide else field_files.VOTES_DTYPE
+        wide = "label" in columns and columns["label"].dtype == np.uint16
+        planes = {name: column.T for name, column in columns.items()}
+        return field_files.join_table(self.tables[wide], planes)
+
+
+class VotesPacking(TablePacking):
+    """Votes or probabilities by class: `voxel`, `label`, `votes`."""
+
+    kind = "votes"
+    tables = field_files.TABLES["votes"]
+
+    def _columns(self, options: PackOptions) -> tuple[Column, ...]:
+        return (
+            Column("voxel", "<i4", _SHUFFLED, "index"),
+            Column("label", "u1", Encoding(), "class", wide="<u2"),
+            Column("votes", "<u2", _SHUFFLED, self.entry.unit),
         )
-        for name, column in columns.items():
-            votes[name] = column
-        return votes
 
 
-class VelocitiesPacking(Packing):
+class VelocitiesPacking(TablePacking):
     """Velocities of moving voxels: `voxel` (N,) and `velocity` (3, N)."""
 
     kind = "velocities"
+    tables = field_files.TABLES["velocities"]
 
     def _columns(self, options: PackOptions) -> tuple[Column, ...]:
-        encoding = Encoding(shuffle=SHUFFLE)
-        return Column("voxel", "<i4", encoding, "index"), Column(
-            "velocity", "<f2", encoding, self.entry.unit, rows=3
+        return Column("voxel", "<i4", _SHUFFLED, "index"), Column(
+            "velocity", "<f2", _SHUFFLED, self.entry.unit, rows=3
         )
 
-    def published_bytes(self, counts: Mapping[str, int]) -> int:
-        """Return the bytes of tables with this many rows."""
-        return counts.get("voxel", 0) * field_files.VELOCITY_DTYPE.itemsize
 
-    def split(self, array: AnyArray) -> Columns:
-        """Return the columns of the table."""
-        return {"voxel": np.ascontiguousarray(array["voxel"]), "velocity": array["velocity"].T}
-
-    def join(self, columns: Columns, into: AnyArray | None = None) -> AnyArray:
-        """Return the table."""
-        table = np.empty(len(columns["voxel"]), field_files.VELOCITY_DTYPE)
-        table["voxel"], table["velocity"] = columns["voxel"], columns["velocity"].T
-        return table
-
-
-class BoxesPacking(Packing):
+class BoxesPacking(TablePacking):
     """Boxes: the real numbers as `geometry` (10, N), and the other columns unchanged."""
 
     kind = "boxes"
+    tables = (_STORED_BOX,)
 
     def _columns(self, options: PackOptions) -> tuple[Column, ...]:
-        encoding = Encoding(shuffle=SHUFFLE)
         return (
-            Column("geometry", "<f8", encoding, self.entry.unit, rows=len(_GEOMETRY), least=FEW),
-            Column("track", "<u4", encoding, "object", least=FEW),
-            Column("label", "<u4", encoding, "class", least=FEW),
-            Column("annotated", "u1", encoding, least=FEW),
+            Column(
+                "geometry",
+                "<f8",
+                _SHUFFLED,
+                self.entry.unit,
+                rows=_STORED_BOX["geometry"].shape[0],
+                least=FEW,
+            ),
+            Column("track", "<u4", _SHUFFLED, "object", least=FEW),
+            Column("label", "<u4", _SHUFFLED, "class", least=FEW),
+            Column("annotated", "u1", _SHUFFLED, least=FEW),
         )
 
     def split(self, array: AnyArray) -> Columns:
         """Return the columns of the table."""
-        flat = {
-            column.name: np.ascontiguousarray(array[column.name]) for column in self.columns[1:]
-        }
-        return {"geometry": np.stack([array[name] for name in _GEOMETRY])} | flat
+        return super().split(array.view(_STORED_BOX))
 
     def join(self, columns: Columns, into: AnyArray | None = None) -> AnyArray:
         """Return the table."""
-        boxes = np.empty(len(columns["track"]), BOXES_DTYPE)
-        for name, row in zip(_GEOMETRY, columns["geometry"], strict=True):
-            boxes[name] = row
-        for column in self.columns[1:]:
-            boxes[column.name] = columns[column.name]
-        return boxes
+        return super().join(columns).view(BOXES_DTYPE)
 
 
 def packing_of(

@@ -7,11 +7,13 @@ from __future__ import annotations
 import io
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from carlasc.errors import ArgumentError, ConflictError, FormatError, StorageError
 from carlasc.storage.files import (
+    AnyPath,
     make_folder,
     remove_file,
     rename,
@@ -23,6 +25,7 @@ from carlasc.storage.files import (
 
 TABLES_MARK = "carlasc-tables.json"  # the file that makes a folder a store of tables
 UNFINISHED_MARK = "unfinished.json"  # its name until the store is complete
+_T = TypeVar("_T")
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
@@ -62,7 +65,7 @@ def _is_store(path: Path) -> bool:
         return file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE
 
 
-def unfinished_error(where: str | os.PathLike[str]) -> FormatError:
+def unfinished_error(where: AnyPath) -> FormatError:
     """Return the error for an unfinished store of any format: it is being written, or the run was
     interrupted.
     """
@@ -135,10 +138,19 @@ class DeferredErrorFile(io.RawIOBase):
         Raises:
             StorageError: a write failed.
         """
-        if self._error is not None and self._place is None:
-            raise self._error
-        if self._error is not None and self._place is not None:
+        if self._error is not None:
+            if self._place is None:
+                raise self._error
             raise storage_error(self._place, self._error) from self._error
+
+    def _unless_failed(self, call: Callable[..., _T], *arguments: Any) -> _T | None:
+        """Call a function unless an earlier call failed; None if this one or an earlier one did."""
+        if self._error is None:
+            try:
+                return call(*arguments)
+            except OSError as error:
+                self._error = error
+        return None
 
     def readable(self) -> bool:
         """Return True."""
@@ -166,11 +178,7 @@ class DeferredErrorFile(io.RawIOBase):
     def write(self, data: Any) -> int:
         """Write all bytes at the position."""
         view = memoryview(data).cast("B")
-        if self._error is None:
-            try:
-                write_at(self._descriptor, view, self._position)
-            except OSError as error:
-                self._error = error
+        self._unless_failed(write_at, self._descriptor, view, self._position)
         self._position += len(view)
         self._size = max(self._size, self._position)
         return len(view)
@@ -178,14 +186,9 @@ class DeferredErrorFile(io.RawIOBase):
     def readinto(self, buffer: Any) -> int:
         """Read bytes at the position; zeros after an error."""
         view = memoryview(buffer).cast("B")
-        data = b""
-        if self._error is None:
-            try:
-                os.lseek(self._descriptor, self._position, os.SEEK_SET)
-                data = os.read(self._descriptor, len(view))
-            except OSError as error:
-                self._error = error
-        if self._error is not None:
+        self._unless_failed(os.lseek, self._descriptor, self._position, os.SEEK_SET)
+        data = self._unless_failed(os.read, self._descriptor, len(view))
+        if data is None:
             data = bytes(len(view))
         view[: len(data)] = data
         self._position += len(data)
@@ -194,11 +197,7 @@ class DeferredErrorFile(io.RawIOBase):
     def truncate(self, size: int | None = None) -> int:
         """Set the size."""
         self._size = self._position if size is None else size
-        if self._error is None:
-            try:
-                os.ftruncate(self._descriptor, self._size)
-            except OSError as error:
-                self._error = error
+        self._unless_failed(os.ftruncate, self._descriptor, self._size)
         return self._size
 
     def close(self) -> None:

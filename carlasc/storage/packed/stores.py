@@ -5,19 +5,21 @@ sequence.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar, cast
 
 import numpy as np
 
 from carlasc.core.arrays import AnyArray, IntArray
 from carlasc.core.grids import Coordinates
-from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, within
 from carlasc.storage import layout
-from carlasc.storage.files import damaged, leads_outside
+from carlasc.storage.files import AnyPath, damaged, leads_outside, unfinished
 from carlasc.storage.layout import identity_of
-from carlasc.storage.packed.output import unfinished_error
+from carlasc.storage.packed.output import refuse_existing, unfinished_error
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter, Sink
 
@@ -84,10 +86,20 @@ class PackedSource(Source):
         """Return the size of the published files by field; empty if it is not recorded."""
         return {}
 
-    @abstractmethod
     def stored_bytes(self) -> dict[str, int]:
         """Return the stored bytes by field, with "documents" for the text files and "index" for
         everything else.
+        """
+        sizes: Counter[str] = Counter()
+        for path, sequence in self.sequences().items():
+            for name in ("documents", *sequence.fields()):
+                sizes[name] += self._stored_bytes(self.nodes[path], name)
+        return dict(sizes) | {"index": self._stored_bytes("", "") - sizes.total()}
+
+    @abstractmethod
+    def _stored_bytes(self, group: str, name: str) -> int:
+        """Return the stored bytes of a field, or of the "documents", of a sequence, or of the whole
+        store if both are empty.
         """
 
 
@@ -175,21 +187,16 @@ class PackedSequence(Sequence, Generic[_FieldReader]):
         """Return the names of the text files."""
         return tuple(name for name in self._documents if not name.startswith(f"{layout.DERIVED}/"))
 
-    def _check_document(self, name: str) -> None:
-        if name not in self._documents:
+    def _check_listed(self, what: str, names: Collection[str], name: str) -> None:
+        if name not in names:
             raise MissingDataError(
                 self.location,
-                expected=f"the text file {name}",
-                found=", ".join(self._documents) or "none",
+                expected=f"the {what} {name}",
+                found=", ".join(sorted(names)) or "none",
             )
 
     def _field(self, field: str) -> _FieldReader:
-        if field not in self._fields:
-            raise MissingDataError(
-                self.location,
-                expected=f"the field {field}",
-                found=", ".join(sorted(self._fields)) or "none",
-            )
+        self._check_listed("field", self._fields, field)
         if field not in self._readers:
             self._readers[field] = self._open_field(field)
         return self._readers[field]
@@ -199,15 +206,50 @@ class PackedSequence(Sequence, Generic[_FieldReader]):
 
 
 class PackedSink(Sink):
-    """Writes a packed store by appending. One writer writes one sequence after the other."""
+    """Writes a packed store by appending. One writer writes one sequence after the other.
 
-    @abstractmethod
+    The store gets its final name only when the sink is finished.
+
+    Attributes:
+        path: final path of the store.
+        part: path of the unfinished store.
+        options: options of the store.
+        overwrite: whether an existing store is replaced.
+        nodes: the group (or folder) of each completed sequence.
+    """
+
+    def __init__(self, path: AnyPath, options: PackOptions | None, overwrite: bool) -> None:
+        """Check the options and the path. Nothing is written yet.
+
+        Raises:
+            ArgumentError: `small` is given, but only zarr has PCodec.
+            ConflictError: something exists at `path`, and `overwrite` is not given.
+        """
+        self.path, self.location = Path(path), str(path)
+        self.part = unfinished(self.path)
+        self.options = options or PackOptions()
+        self.overwrite = overwrite
+        self.nodes: dict[str, str] = {}
+        if self.options.small:
+            raise ArgumentError(
+                "small",
+                expected="a .zarr store",
+                found=f"{path}: only zarr has PCodec",
+                advice="leave `small` out",
+            )
+        refuse_existing(self.path, overwrite)
+
     def finished(self, path: str) -> bool:
-        """Whether an interrupted run has completed this sequence."""
+        """Whether this sequence is complete."""
+        return path in self.nodes
 
     @abstractmethod
-    def sequence(self, path: str) -> PackedWriter:
+    def sequence(self, path: str) -> PackedWriter[Any]:
         """Start a sequence. An incomplete sequence of an interrupted run is removed."""
+
+    def root(self) -> dict[str, Any]:
+        """Return the attributes of the root of the finished store."""
+        return {"type": STORE, "version": VERSION, "complete": True, "sequences": self.nodes}
 
 
 class FieldWriter(ABC):
@@ -215,12 +257,12 @@ class FieldWriter(ABC):
 
     Attributes:
         entry: the field in the layout.
-        frames: the frames written so far, in order.
+        frames: the frames written so far, in order, each with the result of `write`.
     """
 
     def __init__(self, field: str) -> None:
         self.entry = layout.field_named(field)
-        self.frames: dict[int, None] = {}
+        self.frames: dict[int, Any] = {}
 
     def append(self, frame: int, array: AnyArray) -> None:
         """Write one frame.
@@ -234,46 +276,59 @@ class FieldWriter(ABC):
                 "its number", expected=f"frames in rising order, above {last}", found=str(frame)
             )
         self.entry.check(array, "its array")
-        self.write(frame, array)
-        self.frames[frame] = None
+        self.frames[frame] = self.write(frame, array)
 
     @abstractmethod
-    def write(self, frame: int, array: AnyArray) -> None:
-        """Write one frame that fits the field."""
+    def write(self, frame: int, array: AnyArray) -> Any:
+        """Write one frame that fits the field, and return its number of elements."""
 
     @abstractmethod
     def close(self) -> None:
         """Write buffered data."""
 
 
-class PackedWriter(SequenceWriter):
+_FieldWriter = TypeVar("_FieldWriter", bound=FieldWriter)
+
+
+class PackedWriter(SequenceWriter, Generic[_FieldWriter]):
     """Writes one sequence of a packed store, with the frames of each field in ascending order.
 
     Attributes:
         identity: split, name and coordinates; by default those of the path.
+        node: group (or folder) of the sequence in the store.
+        options: options of the store.
         writers: the fields written so far.
         contents: the text files written so far.
     """
 
-    def __init__(self, location: str, path: str) -> None:
-        self.location = location
+    def __init__(self, sink: PackedSink, path: str, node: str) -> None:
+        self.location = f"{sink.part}/{node}"
         self.path = path
+        self.node = node
+        self.options = sink.options
         self.identity: tuple[str | None, str, Coordinates] = identity_of(path)
-        self.writers: dict[str, FieldWriter] = {}
+        self.writers: dict[str, _FieldWriter] = {}
         self.contents: dict[str, bytes] = {}
+        self._finished = sink.nodes
 
     @abstractmethod
-    def _start_field(self, field: str) -> FieldWriter: ...
+    def _start_field(self, field: str) -> _FieldWriter: ...
+
+    @abstractmethod
+    def _finish(self) -> None:
+        """Write everything but the fields, and mark the sequence as complete."""
+
+    def close(self) -> None:
+        """Write buffered frames and mark the sequence as complete."""
+        for writer in self.writers.values():
+            writer.close()
+        self._finish()
+        self._finished[self.path] = self.node
 
     def __getstate__(self) -> dict[str, Any]:
         """Keep only the name, because only one process writes the store."""
-        return {
-            "location": self.location,
-            "path": self.path,
-            "identity": self.identity,
-            "writers": {},
-            "contents": {},
-        }
+        kept = ("location", "path", "identity")
+        return {name: vars(self)[name] for name in kept} | {"writers": {}, "contents": {}}
 
     def has(self, field: str, frame: int) -> bool:
         """Whether this run has written the frame."""
@@ -289,10 +344,8 @@ class PackedWriter(SequenceWriter):
         if field not in self.writers:
             check_names([field], self.location)
             self.writers[field] = self._start_field(field)
-        try:
+        with within(f"{self.location}: field {field}, frame {frame}"):
             self.writers[field].append(frame, array)
-        except FormatError as error:
-            raise error.within(f"{self.location}: field {field}, frame {frame}") from error
 
     def write_document(self, name: str, data: bytes) -> None:
         """Keep a text file's bytes until the sequence is closed."""
@@ -308,6 +361,17 @@ class PackedWriter(SequenceWriter):
         split, name, coordinates = self.identity
         about = {"path": self.path, "split": split, "name": name, "coordinates": coordinates}
         return about | {"fields": sorted(self.writers), "documents": sorted(self.contents)}
+
+
+def check_scale(attributes: Mapping[str, Any], where: str) -> None:
+    """Check the size of a step of quantised coordinates in the attributes of a field.
+
+    Raises:
+        FormatError: it is not a length of at most 1 m.
+    """
+    scale = attributes.get("scale_m", 1)
+    if type(scale) not in (int, float) or not 0 < scale <= 1:
+        raise damaged(where, "a step of coordinates above 0, up to 1 m", repr(scale))
 
 
 def node_of(path: str, where: str) -> str:

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from carlasc.core.arrays import AnyArray
-from carlasc.errors import ArgumentError, FormatError, import_extra
+from carlasc.errors import FormatError, import_extra
 from carlasc.storage import layout
 from carlasc.storage.files import (
+    AnyPath,
     parse_json,
     remove_file,
     remove_stale,
     sync_tree,
     to_json,
-    unfinished,
     write_atomic,
 )
 from carlasc.storage.packed.output import (
@@ -26,11 +25,9 @@ from carlasc.storage.packed.output import (
     UNFINISHED_MARK,
     DeferredErrorFile,
     put_in_place,
-    refuse_existing,
     remove,
 )
 from carlasc.storage.packed.stores import (
-    STORE,
     VERSION,
     FieldWriter,
     PackedSink,
@@ -60,106 +57,64 @@ _PAGE = 8 << 20  # bytes: one page holds one column of a scan
 
 
 class ParquetSink(PackedSink):
-    """Writes a folder of packed Parquet tables.
-
-    It gets its final name only when the sink is finished.
-    """
+    """Writes a folder of packed Parquet tables."""
 
     def __init__(
         self,
-        path: str | os.PathLike[str],
+        path: AnyPath,
         options: PackOptions | None = None,
         overwrite: bool = False,
     ) -> None:
         """Start a store, or continue an interrupted run. Its completed sequences are kept.
 
         Raises:
-            ArgumentError: `small` is given, but Parquet has no PCodec encoding.
+            ArgumentError: `small` is given.
             ConflictError: something exists at `path`, and `overwrite` is not given.
             DependencyError: pyarrow is not installed.
         """
         import_extra("pyarrow.parquet", "parquet")
-        self.path = Path(path)
-        self.location = str(path)
-        self.options = options or PackOptions()
-        self.overwrite = overwrite
-        if self.options.small:
-            raise ArgumentError(
-                "small",
-                expected="a .zarr store",
-                found=f"{path}: Parquet has no PCodec",
-                advice="leave `small` out",
-            )
-        refuse_existing(self.path, overwrite)
-        self._part = unfinished(self.path)
+        super().__init__(path, options, overwrite)
+        mark = self.part / UNFINISHED_MARK
         run = to_json({"version": VERSION, "lossy_mm": self.options.lossy_mm})
-        if (
-            not (self._part / UNFINISHED_MARK).is_file()
-            or (self._part / UNFINISHED_MARK).read_bytes() != run
-        ):
-            remove(self._part)
-            write_atomic(self._part / UNFINISHED_MARK, run)
-        remove_stale(self._part)
-        done = {
-            file: parse_json(file.read_bytes(), str(file))
-            for file in sorted(self._part.rglob(SEQUENCE))
-        }
-        self._sequences = {
-            about["path"]: file.parent.relative_to(self._part).as_posix()
-            for file, about in done.items()
-        }
-        self._numbers = {str(about["path"]): int(about[NUMBER]) for about in done.values()}
-
-    def finished(self, path: str) -> bool:
-        """Whether an interrupted run has completed this sequence."""
-        return path in self._sequences
+        if not mark.is_file() or mark.read_bytes() != run:
+            remove(self.part)
+            write_atomic(mark, run)
+        remove_stale(self.part)
+        self._numbers: dict[str, int] = {}
+        for file in sorted(self.part.rglob(SEQUENCE)):
+            about = parse_json(file.read_bytes(), str(file))
+            self.nodes[about["path"]] = file.parent.relative_to(self.part).as_posix()
+            self._numbers[about["path"]] = int(about[NUMBER])
 
     def sequence(self, path: str) -> ParquetWriter:
         """Start a sequence. An incomplete sequence of an interrupted run is removed."""
-        folder = node_of(path, self.location)
-        self._sequences.pop(path, None)
-        remove(self._part / folder)
+        node = node_of(path, self.location)
+        self.nodes.pop(path, None)
+        remove(self.part / node)
         # A sequence that is written again keeps its number, so that the store has the same bytes as
         # without an interruption.
         number = self._numbers.setdefault(path, 1 + max(self._numbers.values(), default=-1))
-        return ParquetWriter(self._part, path, folder, number, self.options, self._sequences)
+        return ParquetWriter(self, path, node, number)
 
     def finish(self, *, incomplete: bool = False) -> None:
         """Mark the store as finished and rename it."""
-        root = {
-            "type": STORE,
-            "version": VERSION,
-            "complete": True,
-            "sequences": self._sequences,
-            "lossy_mm": self.options.lossy_mm,
-        }
-        write_atomic(self._part / TABLES_MARK, to_json(root))
-        remove_file(self._part / UNFINISHED_MARK)
-        put_in_place(self._part, self.path, self.overwrite)
+        root = self.root() | {"lossy_mm": self.options.lossy_mm}
+        write_atomic(self.part / TABLES_MARK, to_json(root))
+        remove_file(self.part / UNFINISHED_MARK)
+        put_in_place(self.part, self.path, self.overwrite)
 
 
-class ParquetWriter(PackedWriter):
+class ParquetWriter(PackedWriter["TableWriter"]):
     """Writes one sequence of a store of tables."""
 
-    def __init__(
-        self,
-        root: Path,
-        path: str,
-        folder: str,
-        number: int,
-        options: PackOptions,
-        finished: dict[str, str],
-    ) -> None:
-        super().__init__(str(root / folder), path)
-        self._folder = root / folder
-        self._name = folder
+    def __init__(self, sink: ParquetSink, path: str, node: str, number: int) -> None:
+        super().__init__(sink, path, node)
+        self._folder = Path(self.location)
         self._number = number
-        self._options = options
-        self._finished = finished
         self._statistics: dict[int, dict[str, Any]] = {}
 
-    def _start_field(self, field: str) -> FieldWriter:
-        return TableWriter(self._folder / f"{field}.parquet", field, self._number, self._options)
+    def _start_field(self, field: str) -> TableWriter:
+        return TableWriter(self._folder / f"{field}.parquet", field, self._number, self.options)
 
     def write(self, field: str, frame: int, array: AnyArray) -> None:
         """Append one frame as a row group.
@@ -170,23 +125,15 @@ class ParquetWriter(PackedWriter):
         super().write(field, frame, array)
         self._statistics.setdefault(frame, {}).update(statistics(field, array))
 
-    def close(self) -> None:
-        """Finish the tables and mark the sequence as complete."""
-        for table in self.writers.values():
-            table.close()
+    def _finish(self) -> None:
         self._write_frames()
-        self._write_documents()
-        sync_tree(self._folder)  # before the mark is written
-        about = {NUMBER: self._number, FOOTERS: footer_checksums(self._folder)}
-        write_atomic(self._folder / SEQUENCE, to_json(self.about() | about))
-        self._finished[self.path] = self._name
-
-    def _write_documents(self) -> None:
-        """Write the table with one row per text file: its name and its bytes."""
         pa = import_extra("pyarrow", "parquet")
         columns = {"name": pa.array(list(self.contents), pa.string())}
         columns["data"] = pa.array(list(self.contents.values()), pa.binary())
         _write_table(pa.table(columns), self._folder / DOCUMENTS)
+        sync_tree(self._folder)  # before the mark is written
+        about = {NUMBER: self._number, FOOTERS: footer_checksums(self._folder)}
+        write_atomic(self._folder / SEQUENCE, to_json(self.about() | about))
 
     def _write_frames(self) -> None:
         """Write the table with one row per frame: its sequence, pose, time, statistics."""
@@ -211,11 +158,11 @@ class ParquetWriter(PackedWriter):
                 # missing, or not numbers: the text is kept unchanged, and its reader reports the
                 # error
                 continue
-            values = np.array(rows, np.float64).reshape(len(frames), 1 if name == "time_s" else 16)
+            values = np.array(rows, np.float64).reshape(len(frames), *lines.shape[1:])
             columns[name] = (
-                pa.array(values[:, 0])
+                pa.array(values)
                 if name == "time_s"
-                else pa.FixedSizeListArray.from_arrays(values[:, :12].reshape(-1), 12)
+                else pa.FixedSizeListArray.from_arrays(values[:, :3].reshape(-1), 12)
             )
         for name in sorted({name for row in self._statistics.values() for name in row}):
             columns[name] = pa.array([self._statistics[frame].get(name) for frame in frames])
@@ -239,11 +186,10 @@ class TableWriter(FieldWriter):
         self._number = number
         self.path = path
         self.scale_m = options.scale_m if field == "points" else None
-        self.rows: list[int] = []  # number of rows of each frame
         self.attributes: dict[str, Any] = {}
         self._writer: Any = None
 
-    def write(self, frame: int, array: AnyArray) -> None:
+    def write(self, frame: int, array: AnyArray) -> int:
         """Append one row group. An empty frame has no row group."""
         pa = import_extra("pyarrow", "parquet")
         if self._writer is None:
@@ -255,7 +201,7 @@ class TableWriter(FieldWriter):
             arrays = [*map(pa.array, place), *map(pa.array, columns.values())]
             self._writer.write_table(pa.table(arrays, schema=self._schema), row_group_size=count)
             self._file.check()
-        self.rows.append(count)
+        return count
 
     def _start(self, pa: Any, array: AnyArray) -> None:
         parquet = import_extra("pyarrow.parquet", "parquet")
@@ -295,7 +241,7 @@ class TableWriter(FieldWriter):
 
     def close(self) -> None:
         """Write the footer."""
-        about = self.attributes | {"frames": list(self.frames), "rows": self.rows}
+        about = self.attributes | {"frames": [*self.frames], "rows": [*self.frames.values()]}
         self._writer.add_key_value_metadata({"carlasc": json.dumps(about)})
         self._writer.close()
         self._file.close()

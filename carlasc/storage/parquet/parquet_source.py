@@ -7,12 +7,9 @@ footers, and a footer is verified before pyarrow reads it.
 
 from __future__ import annotations
 
-import itertools
 import math
-import os
 import zlib
-from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,12 +17,12 @@ from typing import Any
 import numpy as np
 
 from carlasc.core.arrays import AnyArray
-from carlasc.errors import FormatError, MissingDataError, import_extra, reading
+from carlasc.errors import FormatError, MissingDataError, import_extra, reading, within
 from carlasc.storage import layout
 from carlasc.storage.arrays import check_ratio, check_size
 from carlasc.storage.files import damaged, parse_json
 from carlasc.storage.packed.output import TABLES_MARK
-from carlasc.storage.packed.stores import PackedSequence, PackedSource
+from carlasc.storage.packed.stores import PackedSequence, PackedSource, check_scale
 from carlasc.storage.parquet.table_columns import column_types, join_columns
 from carlasc.storage.protocol import Sequence
 from carlasc.storage.transport.remote_tree import RemoteTree
@@ -65,18 +62,10 @@ class ParquetSource(PackedSource):
             path: ParquetSequence(self.tree, path, folder) for path, folder in self.nodes.items()
         }
 
-    def stored_bytes(self) -> dict[str, int]:
-        """Return the stored bytes by field; empty unless the store is a local folder."""
-        sizes: Counter[str] = Counter()
-        for path, sequence in self.sequences().items():
-            folder = Path(self.location) / self.nodes[path]
-            sizes["documents"] += (folder / DOCUMENTS).stat().st_size
-            for field in sequence.fields():
-                sizes[field] += (folder / f"{field}.parquet").stat().st_size
-        files = (
-            Path(folder) / name for folder, _, names in os.walk(self.location) for name in names
-        )
-        return dict(sizes) | {"index": sum(file.stat().st_size for file in files) - sizes.total()}
+    def _stored_bytes(self, group: str, name: str) -> int:
+        folder = Path(self.location, group)
+        files = [folder / f"{name}.parquet"] if name else folder.rglob("*")
+        return sum(file.stat().st_size for file in files if file.is_file())
 
 
 class ParquetSequence(PackedSequence["FieldTable"]):
@@ -104,21 +93,14 @@ class ParquetSequence(PackedSequence["FieldTable"]):
 
     def read_document(self, name: str) -> bytes:
         """Return a text file's bytes."""
-        self._check_document(name)
+        self._check_listed("text file", self._documents, name)
         path = f"{self.folder}/{DOCUMENTS}"
         self._check_footer(DOCUMENTS)
         with opened(self.tree, path) as file:
-            for column in (
-                g.column(k)
-                for g in map(file.metadata.row_group, range(file.metadata.num_row_groups))
-                for k in range(g.num_columns)
-            ):
-                check_ratio(
-                    column.total_uncompressed_size,
-                    column.total_compressed_size,
-                    self.tree.where(path),
-                )
-            rows = file.read(["name", "data"], use_threads=False).to_pylist()
+            columns = ["name", "data"]
+            for number in range(file.metadata.num_row_groups):
+                _check_ratios(file.metadata.row_group(number), columns, self.tree.where(path))
+            rows = file.read(columns, use_threads=False).to_pylist()
             data = next((row["data"] for row in rows if row["name"] == name), None)
         if not isinstance(data, bytes):
             raise damaged(self.tree.where(path), f"the text file {name}", "none")
@@ -143,14 +125,17 @@ class FieldTable:
         self.where = tree.where(path)
         with opened(tree, path) as file:
             self._metadata = file.metadata
-            about = parse_json(file.metadata.metadata[b"carlasc"], self.where)
-            self._types = column_types(
-                layout.field_named(field), check_attributes(about, self.where)
-            )
+            written = parse_json(file.metadata.metadata[b"carlasc"], self.where)
+            about = check_attributes(written, self.where)
+            self._types = column_types(layout.field_named(field), about)
             _check_types(file.schema_arrow, self._types, self.where)
+        self._dtypes = {
+            name: np.dtype("u1" if type_ == "binary" else type_)
+            for name, type_ in self._types.items()
+        }
         self.attributes = about
         frames, rows = (_counts(about.get(name)) for name in ("frames", "rows"))
-        if not frames or len(frames) != len(rows) or not _rise(frames):
+        if not frames or len(frames) != len(rows) or (np.diff(frames) <= 0).any():
             raise damaged(
                 self.where,
                 "ascending frame numbers, and the number of rows of each",
@@ -168,31 +153,24 @@ class FieldTable:
             )
         rows = self._groups[frame][1]
         where = f"{self.where}: field {self.field}, frame {frame}"
-        most = None if shape is None else math.prod(shape)
-        if most is not None and rows != most:
-            raise damaged(where, f"{most} voxels", str(rows))
+        if shape is not None and rows != math.prod(shape):
+            raise damaged(where, f"{math.prod(shape)} voxels", str(rows))
+        if shape is None:  # the only limit is the size of the largest possible scan
+            for dtype in self._dtypes.values():
+                check_size((rows,), dtype, where)
+        columns = {name: np.empty(0, dtype) for name, dtype in self._dtypes.items()}
         if rows:
-            columns = self._read_group(frame, most is None)
-        else:
-            columns = {
-                name: np.empty(0, "u1" if type_ == "binary" else type_)
-                for name, type_ in self._types.items()
-            }
+            columns = self._read_group(frame, where)
         with reading(where, "values of the field", "the store is damaged"):
             array = join_columns(layout.field_named(self.field), columns, self.attributes)
             return array if shape is None else array.reshape(shape)
 
-    def _read_group(self, frame: int, bounded: bool) -> dict[str, AnyArray]:
+    def _read_group(self, frame: int, where: str) -> dict[str, AnyArray]:
         """Return the columns of a frame.
 
         The numbers of rows and bytes are checked before decompressing.
-
-        With `bounded`, the only limit is the size of the largest possible scan.
         """
-        (group, rows), where = (
-            self._groups[frame],
-            f"{self.where}: field {self.field}, frame {frame}",
-        )
+        group, rows = self._groups[frame]
         with reading(where, "the rows of a frame", "the file may be truncated or corrupted"):
             about = (
                 self._metadata.row_group(group) if group < self._metadata.num_row_groups else None
@@ -200,28 +178,29 @@ class FieldTable:
             if about is None or about.num_rows != rows:
                 found = "none" if about is None else str(about.num_rows)
                 raise damaged(where, f"{rows} rows", found)
-            if bounded:
-                for type_ in self._types.values():
-                    check_size((rows,), np.dtype("u1" if type_ == "binary" else type_), where)
-            for column in map(about.column, range(about.num_columns)):
-                if column.path_in_schema in self._types:
-                    check_ratio(column.total_uncompressed_size, column.total_compressed_size, where)
-        try:
-            with opened(self.tree, self.path, self._metadata) as file:
-                table = file.read_row_group(group, columns=list(self._types), use_threads=False)
-                columns = {name: _to_numpy(table[name]) for name in self._types}
-        except FormatError as error:
-            raise error.within(f"field {self.field}, frame {frame}") from error
+            _check_ratios(about, self._types, where)
+        with (
+            within(f"field {self.field}, frame {frame}"),
+            opened(self.tree, self.path, self._metadata) as file,
+        ):
+            table = file.read_row_group(group, columns=list(self._types), use_threads=False)
+            columns = {name: _to_numpy(table[name]) for name in self._types}
         for name, column in columns.items():
-            if len(column) != rows or column.dtype != (
-                object if self._types[name] == "binary" else self._types[name]
-            ):
+            is_bytes = self._types[name] == "binary"
+            if len(column) != rows or column.dtype != (object if is_bytes else self._dtypes[name]):
                 raise FormatError(
                     where,
                     expected=f"{rows} values of {self._types[name]} in {name}",
                     found=f"{len(column)} of {column.dtype}",
                 )
         return columns
+
+
+def _check_ratios(group: Any, names: Container[str], where: str) -> None:
+    """Check the compression ratios of the named columns of a row group."""
+    for column in map(group.column, range(group.num_columns)):
+        if column.path_in_schema in names:
+            check_ratio(column.total_uncompressed_size, column.total_compressed_size, where)
 
 
 @contextmanager
@@ -253,15 +232,10 @@ def check_attributes(about: Any, where: str) -> Mapping[str, Any]:
         FormatError: they are missing, the step of coordinates is not a valid length, or labels do
             not have one or two bytes.
     """
-    scale, label_bytes = about.get("scale_m"), about.get("label_bytes", 1)
-    if (
-        "scale_m" in about and not (type(scale) in (int, float) and 0 < scale <= 1)
-    ) or label_bytes not in (1, 2):
-        raise damaged(
-            where,
-            "a step of coordinates up to 1 m, and labels of 1 or 2 bytes",
-            f"{scale!r} and {label_bytes!r}",
-        )
+    check_scale(about, where)
+    label_bytes = about.get("label_bytes", 1)
+    if label_bytes not in (1, 2):
+        raise damaged(where, "labels of 1 or 2 bytes", repr(label_bytes))
     return {**about, "label_bytes": label_bytes}
 
 
@@ -274,11 +248,8 @@ def footer_checksum(tree: Tree, path: str) -> int:
     """
     end = bytes(tree.read_range(path, -_END, 0))
     if len(end) != _END or not end.endswith(_MARK):
-        raise FormatError(
-            tree.where(path),
-            expected="a Parquet file",
-            found="another end of the file",
-            advice="it may be truncated",
+        raise damaged(
+            tree.where(path), "a Parquet file", "another end of the file", "it may be truncated"
         )
     length = int.from_bytes(end[:4], "little")
     if length > _LONGEST:
@@ -330,10 +301,6 @@ def _counts(values: object) -> list[int]:
         type(value) is int and 0 <= value < 2**48 for value in values
     )
     return values if right else []  # type: ignore[return-value]
-
-
-def _rise(values: list[int]) -> bool:
-    return all(one < other for one, other in itertools.pairwise(values))
 
 
 def _to_numpy(column: Any) -> AnyArray:

@@ -13,7 +13,7 @@ import numpy as np
 from carlasc.core.arrays import AnyArray
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.errors import FormatError
-from carlasc.storage.field_files import VELOCITY_DTYPE, VOTES_DTYPE, WIDE_VOTES_DTYPE, Field
+from carlasc.storage.field_files import TABLES, VELOCITY_DTYPE, Field, join_table
 from carlasc.storage.packed.columns import narrow, quantise
 
 AXES = frozenset("xyz")
@@ -107,22 +107,10 @@ def join_columns(
     if entry.kind == "picture":
         return np.frombuffer(first[0], np.uint8)
     if entry.kind == "velocities":
-        table = np.empty(len(first), VELOCITY_DTYPE)
-        table["voxel"] = first
-        table["velocity"] = np.column_stack([columns[name] for name in _VELOCITY])
-        return table
-    if entry.kind in ("votes", "boxes"):
-        dtype = (
-            BOXES_DTYPE
-            if entry.kind == "boxes"
-            else VOTES_DTYPE
-            if attributes["label_bytes"] == 1
-            else WIDE_VOTES_DTYPE
-        )
-        table = np.empty(len(first), dtype)
-        for name, column in columns.items():
-            table[name] = column
-        return table
+        velocity = np.column_stack([columns[name] for name in _VELOCITY])
+        return join_table(VELOCITY_DTYPE, {"voxel": first, "velocity": velocity})
+    if entry.kind in TABLES:
+        return join_table(TABLES[entry.kind][attributes["label_bytes"] - 1], columns)
     if len(columns) == 1:
         return narrow(first) if entry.kind == "class" else first
     rows, scale = np.empty((len(first), len(columns)), entry.dtype), attributes.get("scale_m")

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import FormatError
-from carlasc.storage.files import parse_json, to_json
+from carlasc.storage.files import damaged, parse_json, to_json
 from carlasc.storage.packed.array_fields import ArrayField
 from carlasc.storage.packed.array_layout import FieldLayout, FrameTable
 from carlasc.storage.packed.stores import PackOptions
@@ -61,25 +60,30 @@ def encode_frame(field_layout: FieldLayout, array: NDArray[np.generic]) -> Encod
     )
 
 
+@dataclass(eq=False)
 class StoredField:
     """A field of a store that is being written.
 
     Attributes:
         node: group of the field.
-        field: name of the field.
+        name: name of the field.
+        options: options of the store.
     """
 
-    def __init__(self, target: Target, node: str, field: str, options: PackOptions) -> None:
-        self.target = target
-        self.node = node
-        self.field = field
-        self.options = options
-        self.where = f"{target.location}/{node}"
-        self._layout: FieldLayout | None = None
-        self._tables: dict[int, FrameTable | None] = {}
-        self._listed_s: float | None = None
-        self._denied: set[int] = set()
-        self._asked = 0
+    target: Target
+    node: str
+    name: str
+    options: PackOptions
+    _layout: FieldLayout | None = None
+    _tables: dict[int, FrameTable] = field(default_factory=dict)
+    _listed_s: float | None = None
+    _denied: set[int] = field(default_factory=set)
+    _asked: int = 0
+
+    @property
+    def where(self) -> str:
+        """Name of the field in errors."""
+        return f"{self.target.location}/{self.node}"
 
     def layout(self) -> FieldLayout | None:
         """Return the layout of the field; None if the field does not exist."""
@@ -88,7 +92,7 @@ class StoredField:
             if (data := self.target.read(path)) is None:
                 return None
             attributes = parse_json(data, self.target.tree.where(path)).get("attributes")
-            self._layout = FieldLayout.read(self.where, self.field, attributes)
+            self._layout = FieldLayout.read(self.where, self.name, attributes)
         return self._layout
 
     def create(self, typical: Callable[[], tuple[int, ...]]) -> FieldLayout:
@@ -101,7 +105,7 @@ class StoredField:
         """
         if (field_layout := self.layout()) is not None:
             return field_layout
-        planned = FieldLayout.plan(self.field, self.options, typical())
+        planned = FieldLayout.plan(self.name, self.options, typical())
         self.target.put(
             f"{self.node}/{METADATA}", to_json(group_metadata(planned.attributes)), create=True
         )
@@ -109,9 +113,7 @@ class StoredField:
 
     def _known_layout(self) -> FieldLayout:
         if (field_layout := self.layout()) is None:
-            raise FormatError(
-                self.where, expected="the field", found="none", advice="another program removed it"
-            )
+            raise damaged(self.where, "the field", "none", "another program removed it")
         return field_layout
 
     def has(self, frame: int) -> bool:
@@ -145,12 +147,12 @@ class StoredField:
         whole = {
             block: table
             for block, table in self._tables.items()
-            if len(table or {}) == self.options.block
+            if len(table) == self.options.block
         }
         self._tables, self._listed_s, self._denied, self._asked = dict(whole), None, set(), 0
 
     def _exists(self, frame: int) -> bool:
-        return frame in (self._tables.get(frame // self.options.block) or {})
+        return frame in self._tables.get(frame // self.options.block, {})
 
     def _list(self) -> None:
         """Read the tables of all blocks that may have changed."""
@@ -162,25 +164,24 @@ class StoredField:
         changed = [
             path
             for path, block in tables.items()
-            if len(self._tables.get(block) or {}) < self.options.block
+            if len(self._tables.get(block, {})) < self.options.block
         ]
         for path, data in zip(changed, self.target.tree.read_many(changed), strict=True):
             self._tables[tables[path]] = self._parse(data, path)
         self._listed_s = time.monotonic()
         self._denied = set()
 
-    def table(self, block: int) -> FrameTable | None:
-        """Read the table of a block; None if the block does not exist."""
+    def table(self, block: int) -> FrameTable:
+        """Read the table of a block; empty if the block does not exist."""
         path = table_path(self.node, block)
-        data = self.target.read(path)
-        return None if data is None else self._parse(data, path)
+        return self._parse(self.target.read(path) or b"", path)
 
-    def _parse(self, data: bytes | memoryview, path: str) -> FrameTable | None:
-        """Return a table; None for an empty file, which a power failure can leave.
+    def _parse(self, data: bytes | memoryview, path: str) -> FrameTable:
+        """Return a table; empty for an empty file, which a power failure can leave.
 
         The block is then written again.
         """
-        return parse_table(bytes(data), self.target.tree.where(path)) if data else None
+        return parse_table(bytes(data), self.target.tree.where(path)) if data else {}
 
     def read(self, frame: int) -> NDArray[np.generic] | None:
         """Read a frame; None if it does not exist."""
@@ -190,20 +191,18 @@ class StoredField:
             return None
         if not self._exists(frame):
             self._tables[block] = self.table(block)
-        needed = (self._tables[block] or {}).get(frame)
+        needed = self._tables[block].get(frame)
         if needed is None:
             return None
-        counts = {name: np.array([needed.get(name, 0)]) for name in field_layout.columns}
-        local = isinstance(self.target, LocalTarget)
-        field = ArrayField(
+        found = ArrayField(
             self.where,
             field_layout,
             np.array([frame]),
-            counts,
+            {name: np.array([needed.get(name, 0)]) for name in field_layout.columns},
             lambda name: self._array(field_layout, name, block),
-            local=local,
+            local=isinstance(self.target, LocalTarget),
         )
-        return field.read([frame])[0]
+        return found.read([frame])[0]
 
     def _array(self, field_layout: FieldLayout, name: str, block: int) -> ZarrArray:
         size = self.options.block
@@ -216,7 +215,7 @@ class StoredField:
         """Return the columns whose object changes when frames are written to a block: columns that
         they use, or used before.
         """
-        before = self._tables.get(block) or {}
+        before = self._tables.get(block, {})
         needed = {
             name
             for frame, encoded in frames.items()
@@ -254,17 +253,12 @@ class StoredField:
 
         Its objects must be complete.
         """
-        path, ours = (
-            table_path(self.node, block),
-            {frame: encoded.counts for frame, encoded in frames.items()},
-        )
-        if not self.target.put(path, format_table(ours), create=True):
-            there = self.table(block) or {}
-            while there | ours != there:
-                self.target.put(path, format_table(there | ours))
-                there = self.table(block) or {}
-            ours = there
+        path, ours = table_path(self.node, block), {f: e.counts for f, e in frames.items()}
         self._tables[block] = ours
+        if not self.target.put(path, format_table(ours), create=True):
+            while (there := self.table(block)) | ours != there:
+                self.target.put(path, format_table(there | ours))
+            self._tables[block] = there
 
 
 def _merge(there: bytes, new: Mapping[int, bytes], taken: set[int], room: int, where: str) -> bytes:
@@ -316,7 +310,5 @@ def parse_table(data: bytes, where: str) -> FrameTable:
             for frame, counts in frames.items()
         }
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise FormatError(
-            where, expected="the frames of a block", found="something else",
-            advice="remove this file and run the same command again",
-        ) from error  # fmt: skip
+        advice = "remove this file and run the same command again"
+        raise damaged(where, "the frames of a block", "something else", advice) from error

@@ -8,6 +8,7 @@ from __future__ import annotations
 from array import array
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,7 @@ _RESIDUE = 0x48674BC7  # crc32c of any bytes followed by their crc32c
 _ABSENT = 2**64 - 1  # offset and length of a missing chunk
 
 
+@dataclass(eq=False)
 class ZarrArray(StoredArray):
     """A zarr array whose codecs are bytes or PCodec, Blosc, and crc32c, in shards along its first
     axis or in one chunk.
@@ -49,6 +51,8 @@ class ZarrArray(StoredArray):
     """
 
     per_shard: int | None = None
+    _index_first: bool = False
+    _indices: dict[int, ShardIndex] = field(default_factory=dict)
 
     @classmethod
     def from_metadata(cls, tree: Tree, node: str, metadata: Mapping[str, Any]) -> ZarrArray:
@@ -83,11 +87,7 @@ class ZarrArray(StoredArray):
             opened._index_first = (
                 sharded and metadata["codecs"][0]["configuration"].get("index_location") == "start"
             )
-        opened._indices = {}
         return opened
-
-    _index_first: bool
-    _indices: dict[int, ShardIndex]
 
     def locate(self, numbers: Sequence[int]) -> list[tuple[str, int, int]]:
         """Look up chunks in the indices of their shards.
@@ -193,7 +193,7 @@ class ShardIndex:
 
 def encode_chunk(chunk: AnyArray, encoding: Encoding) -> bytes:
     """Return the encoded bytes of a chunk, with its checksum."""
-    return _with_checksum(encoding.encode(chunk, "zarr"))
+    return _with_checksum(encoding.encode(chunk))
 
 
 def join_shard(chunks: Mapping[int, bytes | memoryview], per_shard: int) -> bytes:
@@ -240,7 +240,7 @@ def without_checksum(data: memoryview, what: str) -> memoryview:
     Raises:
         FormatError: the checksum does not match.
     """
-    if len(data) < _CHECKSUM or crc32c(data, "zarr") != _RESIDUE:
+    if len(data) < _CHECKSUM or crc32c(data) != _RESIDUE:
         raise FormatError(
             what,
             problem="the checksum does not match",
@@ -264,7 +264,7 @@ def _numbers(values: Any, least: int) -> tuple[int, ...]:
 
 
 def _with_checksum(data: bytes) -> bytes:
-    return data + crc32c(data, "zarr").to_bytes(_CHECKSUM, "little")
+    return data + crc32c(data).to_bytes(_CHECKSUM, "little")
 
 
 def group_metadata(

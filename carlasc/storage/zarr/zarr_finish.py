@@ -7,23 +7,23 @@ can be interrupted and repeated.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from carlasc.core.arrays import AnyArray
-from carlasc.errors import ConflictError, FormatError, MissingDataError
-from carlasc.storage.files import damaged, parse_json, remove_stale, to_json
+from carlasc.errors import ConflictError, MissingDataError
+from carlasc.storage.files import AnyPath, damaged, parse_json, remove_stale, to_json
 from carlasc.storage.packed.array_layout import (
     FIELD,
     SEQUENCE,
     FieldLayout,
     FrameTable,
-    count_elements,
     document_node,
     field_node,
-    number_arrays,
+    index_arrays,
 )
 from carlasc.storage.packed.chunks import SHUFFLE, Encoding, in_threads
 from carlasc.storage.packed.stores import STORE, VERSION, check_names
@@ -71,9 +71,26 @@ class StoreNodes:
             self.metadata.setdefault("/".join(parts[:end]), group_metadata({}))
         self.metadata[node] = group_metadata(attributes)
 
+    def fields(
+        self,
+        node: str,
+        fields: Mapping[str, FieldLayout],
+        tables: Mapping[str, FrameTable],
+        block: int,
+    ) -> None:
+        """Add the groups of the fields of a sequence, and the columns that frames use."""
+        for name, found in fields.items():
+            group, table = f"{node}/{field_node(name)}", tables[name]
+            self.group(group, found.attributes)
+            room = -(-(max(table) + 1) // block) * block
+            for column in found.columns.values():
+                if any(counts.get(column.name) for counts in table.values()):
+                    metadata = column_metadata(found, column, block, room)
+                    self.metadata[f"{group}/{column.name}"] = metadata
+
     def small(self, node: str, values: AnyArray, attributes: Mapping[str, Any]) -> None:
         """Add an array of one chunk."""
-        about = {"version": VERSION, "dtype": values.dtype.name, **attributes}
+        about = {"version": VERSION, "dtype": values.dtype.name, **attributes}  # in this order
         chunk = tuple(max(1, n) for n in values.shape)
         self.metadata[node] = array_metadata(values.dtype, values.shape, chunk, _SMALL, about)
         if values.size:
@@ -82,7 +99,7 @@ class StoreNodes:
 
 
 def finish(
-    out: str | os.PathLike[str] | Target, *, incomplete: bool = False, **storage_options: Any
+    out: AnyPath | Target, *, incomplete: bool = False, **storage_options: Any
 ) -> FinishedStore:
     """Write the metadata of a zarr store, so that it can be opened.
 
@@ -104,7 +121,7 @@ def finish(
     """
     target = target_of(out, **storage_options)
     if isinstance(target, LocalTarget):
-        remove_stale(target.folder, deep=True)
+        remove_stale(target.folder)
     paths = sorted(target.paths())
     while True:
         result = _write_metadata(target, paths, incomplete)
@@ -126,23 +143,44 @@ def _write_metadata(target: Target, paths: list[str], incomplete: bool) -> Finis
         )
     if not isinstance(block := root.get("block"), int) or block < 1:
         raise damaged(target.location, "a number of frames in block", repr(block))
-    groups = _groups(target, paths)
+    groups, tables = _groups(target, paths), _read_tables(target, paths)
     result, nodes, sequences = FinishedStore(target.location), StoreNodes(), dict[str, str]()
     for node, attributes in groups.items():
-        if attributes.get("type") == SEQUENCE:
-            if not {"path", "split", "name", "coordinates"} <= attributes.keys():
-                raise damaged(
-                    f"{target.location}/{node}", "the attributes of a sequence", "some missing"
-                )
-            sequences[attributes["path"]] = node
-            inside = [path for path in paths if path.startswith(f"{node}/")]
-            fields = {
-                name: about
-                for name, about in groups.items()
-                if about.get("type") == FIELD
-                and name == f"{node}/{field_node(about.get('field', ''))}"
-            }
-            _finish_sequence(target, node, attributes, inside, fields, block, nodes, result)
+        if attributes.get("type") != SEQUENCE:
+            continue
+        if not {"path", "split", "name", "coordinates"} <= attributes.keys():
+            raise damaged(
+                f"{target.location}/{node}", "the attributes of a sequence", "some missing"
+            )
+        sequences[attributes["path"]] = node
+        fields = {
+            about["field"]: FieldLayout.read(f"{target.location}/{name}", about["field"], about)
+            for name, about in groups.items()
+            if about.get("type") == FIELD
+            and name == f"{node}/{field_node(about.get('field', ''))}"
+            and tables.get(name)
+        }
+        frames = {name: tables[f"{node}/{field_node(name)}"] for name in sorted(fields)}
+        result.sequences[attributes["path"]] = {name: len(table) for name, table in frames.items()}
+        missing = {
+            name: len(numbers - frames.get(name, {}).keys())
+            for name, numbers in read_expected(target, node).items()
+        }
+        if missing := {name: count for name, count in missing.items() if count}:
+            result.missing[attributes["path"]] = missing
+        documents = sorted(
+            path.removeprefix(f"{node}/{document_node('')}")
+            for path in paths
+            if path.startswith(f"{node}/{document_node('')}")
+        )
+        nodes.group(node, {**attributes, "fields": sorted(frames), "documents": documents})
+        nodes.fields(node, fields, frames, block)
+
+        def read_document(name: str, node: str = node) -> bytes | None:
+            return target.read(f"{node}/{document_node(name)}")
+
+        for name, values, about in index_arrays(fields, frames, read_document):
+            nodes.small(f"{node}/{name}", values, about)
     check_names([*sequences, *sequences.values()], target.location)
     if result.missing and not incomplete:
         raise _missing(result)
@@ -172,54 +210,6 @@ def _groups(target: Target, paths: Iterable[str]) -> dict[str, dict[str, Any]]:
     return attributes
 
 
-def _finish_sequence(
-    target: Target,
-    node: str,
-    attributes: Mapping[str, Any],
-    paths: list[str],
-    groups: Mapping[str, Mapping[str, Any]],
-    block: int,
-    nodes: StoreNodes,
-    result: FinishedStore,
-) -> None:
-    """Add the nodes of a sequence, and count its frames."""
-    fields, tables = dict[str, FieldLayout](), _read_tables(target, paths)
-    for group, about in groups.items():
-        name = about["field"]
-        if tables.get(group):
-            fields[name] = FieldLayout.read(f"{target.location}/{group}", name, about)
-            nodes.group(group, about)
-    frames_by_field = {name: tables[f"{node}/{field_node(name)}"] for name in sorted(fields)}
-    _count(target, node, attributes["path"], paths, frames_by_field, result)
-    frames, counts, columns = count_elements(fields, frames_by_field)
-    for column_path, most in zip(columns, counts.max(axis=0, initial=0).tolist(), strict=True):
-        kind, _, column = column_path.rpartition("/")
-        name = kind.partition("/")[2]
-        if most > 0:
-            room = -(-(max(frames_by_field[name]) + 1) // block) * block
-            nodes.metadata[f"{node}/{column_path}"] = column_metadata(
-                fields[name], fields[name].columns[column], block, room
-            )
-    documents = sorted(
-        path.removeprefix(f"{node}/{document_node('')}")
-        for path in paths
-        if path.startswith(f"{node}/{document_node('')}")
-    )
-    nodes.group(node, {**attributes, "fields": sorted(frames_by_field), "documents": documents})
-    nodes.small(f"{node}/frames", frames, {"type": "carlasc.frames", "unit": "frame"})
-    nodes.small(
-        f"{node}/counts", counts, {"type": "carlasc.counts", "unit": "element", "columns": columns}
-    )
-
-    def read_document(name: str) -> bytes | None:
-        return (
-            bytes(target.tree.read(f"{node}/{document_node(name)}")) if name in documents else None
-        )
-
-    for name, numbers, about in number_arrays(read_document):
-        nodes.small(f"{node}/{name}", numbers, about)
-
-
 def _read_tables(target: Target, paths: Iterable[str]) -> dict[str, FrameTable]:
     """Return the frames of each field, by its group."""
     files = [path for path in paths if block_of(path) is not None]
@@ -230,57 +220,34 @@ def _read_tables(target: Target, paths: Iterable[str]) -> dict[str, FrameTable]:
     return tables
 
 
-def _count(
-    target: Target,
-    node: str,
-    path: str,
-    paths: list[str],
-    tables: Mapping[str, FrameTable],
-    result: FinishedStore,
-) -> None:
-    """Count the frames of a sequence, and its missing announced frames."""
-    result.sequences[path] = {name: len(table) for name, table in tables.items()}
-    announced = f"{node}/{EXPECTED}"
-    if announced not in paths:
-        return
-    expected = parse_expected(bytes(target.tree.read(announced)), target.tree.where(announced))
-    missing = {name: len(frames - tables.get(name, {}).keys()) for name, frames in expected.items()}
-    if missing := {name: count for name, count in missing.items() if count}:
-        result.missing[path] = missing
-
-
-def format_expected(frames: Mapping[str, set[int]]) -> bytes:
-    """Return the announced frames as bytes: ranges [first, end) by field."""
-    ranges: dict[str, list[list[int]]] = {}
-    for name in sorted(frames):
-        stretches = ranges.setdefault(name, [])
-        for frame in sorted(frames[name]):
-            if stretches and stretches[-1][1] == frame:
-                stretches[-1][1] += 1
-            else:
-                stretches.append([frame, frame + 1])
-    return to_json(ranges)
-
-
-def parse_expected(data: bytes, where: str) -> dict[str, set[int]]:
-    """Read the announced frames.
+def read_expected(target: Target, node: str) -> dict[str, set[int]]:
+    """Return the announced frames of a sequence, by field.
 
     Raises:
         FormatError: they are damaged.
     """
+    path = f"{node}/{EXPECTED}"
+    data = target.read(path)
+    where = target.tree.where(path)
     try:
-        tables = parse_json(data, where).items()
         return {
             name: {frame for first, end in ranges for frame in range(first, end)}
-            for name, ranges in tables
+            for name, ranges in ({} if data is None else parse_json(data, where)).items()
         }
     except (TypeError, ValueError) as error:
-        raise FormatError(
-            where,
-            expected="ranges of frames",
-            found="something else",
-            advice="remove this file and run again",
+        raise damaged(
+            where, "ranges of frames", "something else", "remove this file and run again"
         ) from error
+
+
+def format_expected(frames: Mapping[str, set[int]]) -> bytes:
+    """Return the announced frames as bytes: ranges [first, end) by field."""
+    ranges = {}
+    for name in sorted(frames):
+        numbers = np.array(sorted(frames[name]), np.int64)
+        stretches = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
+        ranges[name] = [[int(one[0]), int(one[-1]) + 1] for one in stretches if len(one)]
+    return to_json(ranges)
 
 
 def _missing(result: FinishedStore) -> ConflictError:

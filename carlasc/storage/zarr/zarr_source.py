@@ -7,7 +7,6 @@ tenth of the time of zarr-python per chunk.
 
 from __future__ import annotations
 
-import os
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from carlasc.core.arrays import AnyArray
-from carlasc.errors import FormatError, MissingDataError, import_extra, reading
+from carlasc.errors import MissingDataError, import_extra, reading, within
 from carlasc.storage.files import damaged, parse_json
 from carlasc.storage.packed.array_source import ArraySource, ArrayStore
 from carlasc.storage.transport.remote_tree import RemoteTree
@@ -72,10 +71,8 @@ class ZarrStore(ArrayStore):
         if 0 in array.shape:
             with reading(f"{self.location}/{node}", "the shape of an array"):
                 return np.empty(array.shape, array.dtype)
-        try:
+        with within(f"{self.location}/{node}"):
             return array.read_chunk(0)[tuple(slice(n) for n in array.shape)]
-        except FormatError as error:
-            raise error.within(f"{self.location}/{node}") from error
 
     def read_document(self, node: str) -> bytes:
         """Return the bytes of a text file, which is one file in the store."""
@@ -98,33 +95,18 @@ class ZarrStore(ArrayStore):
         if isinstance(self.tree, RemoteTree):
             prefix = f"{node}/" if node else ""
             return sum(size for path, size in self._sizes.items() if path.startswith(prefix))
-        files = os.walk(f"{self.location}/{node}")
-        return sum(
-            (Path(folder) / name).stat().st_size for folder, _, names in files for name in names
-        )
+        files = Path(self.location, node).rglob("*")
+        return sum(file.stat().st_size for file in files if file.is_file())
 
     def _metadata(self, node: str) -> dict[str, Any] | None:
         if not node:
             return self._root
-        consolidated = self._root.get("consolidated_metadata")
-        if consolidated:
-            where = self.tree.where(METADATA)
-            nodes = _mapping(
-                _mapping(consolidated, where, "consolidated_metadata").get("metadata"),
-                where,
-                "metadata",
-            )
-            return (
-                None
-                if node not in nodes
-                else _mapping(nodes[node], f"{self.location}/{node}", "metadata")
-            )
-        path = f"{node}/{METADATA}"
-        return (
-            parse_json(bytes(self.tree.read(path)), self.tree.where(path))
-            if self.tree.is_file(path)
-            else None
-        )
+        where, nodes = self.tree.where(METADATA), self._root
+        for name in ("consolidated_metadata", "metadata"):
+            nodes = _mapping(nodes.get(name), where, name)
+        if node not in nodes:
+            return None
+        return _mapping(nodes[node], f"{self.location}/{node}", "metadata")
 
     def __getstate__(self) -> dict[str, Any]:
         return {
