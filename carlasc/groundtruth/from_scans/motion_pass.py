@@ -290,10 +290,10 @@ class Kept:
             None if self.writer is None else read_derived(self.writer, self.name, self.key, parse)
         )
 
-    def write(self, made: MovingActors | RefinedPoses) -> None:
-        """Write the file."""
-        if self.writer is not None:
-            self.writer.write_document(layout.derived(self.name, self.key), made.to_bytes(self.key))
+    @property
+    def document(self) -> str:
+        """Name of the file in the folder of the sequence."""
+        return layout.derived(self.name, self.key)
 
 
 def refine_sequence(
@@ -319,7 +319,8 @@ def refine_sequence(
     given = np.stack([feed.pose(frame) for frame in frames])
     with _each(partial(_thin_scan, feed=feed), frames, run) as scans:
         refined = refine_poses(scans, given, always=mode == "always", steps=steps)
-    file.write(refined)
+    if writer is not None:
+        writer.write_document(file.document, refined.to_bytes(file.key))
     return refined
 
 
