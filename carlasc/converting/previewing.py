@@ -22,7 +22,7 @@ from carlasc.converting.plans import (
 from carlasc.converting.protocol import Converter, Recording
 from carlasc.converting.registry import find_recordings, open_converter
 from carlasc.core.arrays import Float32Array
-from carlasc.groundtruth.heights import find_ground
+from carlasc.motion.ground import find_ground
 from carlasc.motion.options import PoseOptions
 
 _LEAST_M = 0.3  # ground must be at least this far below the sensor

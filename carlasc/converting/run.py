@@ -22,9 +22,9 @@ from carlasc.converting.registry import find_recordings, open_converter
 from carlasc.converting.stages import Conversion
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError, check_choice
-from carlasc.groundtruth.heights import Ground, fit_to_ground, joined
-from carlasc.groundtruth.options import FromScans, GridOptions, Voting
+from carlasc.groundtruth.options import FromScans, GridOptions, Voting, fit_to_ground
 from carlasc.groundtruth.run import RegridResult, regrid
+from carlasc.motion.ground import Ground, joined
 from carlasc.motion.options import PoseOptions
 from carlasc.running.processes import one_pool
 from carlasc.running.spreading import Part, Run, StepCounter

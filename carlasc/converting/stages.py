@@ -51,8 +51,8 @@ from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import invert
 from carlasc.core.grids import GridSpec, mirror_grid
 from carlasc.errors import CarlascError, StorageError
-from carlasc.groundtruth.heights import Ground, find_ground
 from carlasc.motion import Track, tracks_from_boxes
+from carlasc.motion.ground import Ground, find_ground
 from carlasc.motion.odometry import UsableScan, usable_points
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter

@@ -259,10 +259,10 @@ class SequenceInput(ABC):
         return 0
 
     def frame(self, number: int) -> FrameInput | None:
-        """Return a frame of the output, also one that only an earlier run chose; None if it is
-        unknown.
+        """Return a frame of the output that is not among `frames`, as one that only an earlier run
+        chose; None if it is unknown.
         """
-        return next((frame for frame in self.frames if frame.number == number), None)
+        return None
 
     def summaries(self) -> Series[Mapping[str, Any]] | None:
         """Return the facts of each actor, by number; None if actors are not tracked."""

@@ -6,7 +6,10 @@ Each is checked when it is made.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from carlasc.core.choices import Complete as Complete  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import Dynamic as Dynamic  # noqa: PLC0414 (part of this module)
@@ -15,6 +18,9 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, check_choice
 from carlasc.groundtruth.voting.ballot import VoteRule, check_rule
 from carlasc.motion.options import MotionOptions, PoseOptions
+
+if TYPE_CHECKING:
+    from carlasc.motion.ground import Ground
 
 
 @dataclass(frozen=True)
@@ -182,3 +188,30 @@ class GridOptions:
     observe: Observe | None = None
     voting: Voting | None = None
     follow_ground: bool = True
+
+
+_BELOW = 0.05  # greatest share of ground points below a grid; fact: below-grid
+_LOW = 0.05  # quantile of the heights of ground points that a moved grid contains
+_SLACK_M = 0.6  # a grid that begins so far below the ground is moved up
+
+
+def share_below(ground: Ground, spec: GridSpec) -> float:
+    """Return the share of ground points that are below a grid."""
+    return float((ground.heights_m < spec.lower[2]).mean())
+
+
+def fit_to_ground(spec: GridSpec, ground: Ground) -> GridSpec:
+    """Return a grid moved up or down by whole voxels so that the ground is in its lowest layers;
+    unchanged if it already is.
+    """
+    size = float(spec.voxel_size[2])
+    low = float(np.quantile(ground.heights_m, _LOW))
+    if share_below(ground, spec) <= _BELOW and low - spec.lower[2] < max(_SLACK_M, 2 * size):
+        return spec
+    layers = int(np.floor((low - spec.lower[2]) / size))
+    if not layers:
+        return spec
+    (x0, y0, z0), (x1, y1, z1) = spec.lower, spec.upper
+    # params.json has float32 bounds
+    low, high = (float(np.float32(z + layers * size)) for z in (z0, z1))
+    return replace(spec, lower=(x0, y0, low), upper=(x1, y1, high))

@@ -109,25 +109,6 @@ class ActorTrack:
     residual_static_m: float | None
     confidence: float
 
-    @classmethod
-    def of(
-        cls, summary: Mapping[str, Any], residuals: Sequence[Residual], classes: ClassTable
-    ) -> ActorTrack:
-        """Return the actor that a summary of the tracks describes."""
-        count = sum(residual.count for residual in residuals)
-        same = ("instance", "first", "last", "points", "speed_m_s", "faces", "confidence")
-        return cls(
-            **{name: summary[name] for name in same},
-            label=classes.names.get(summary["label"], str(summary["label"])),
-            observations=summary["scans"],
-            size_m=tuple(summary["size_m"]),
-            seen_m=tuple(summary["seen_m"]),
-            residual_m=round(sum(r.moving_m for r in residuals) / count, 4) if count else None,
-            residual_static_m=round(sum(r.static_m for r in residuals) / count, 4)
-            if count
-            else None,
-        )
-
 
 def actors_of(
     summaries: Sequence[Mapping[str, Any]],
@@ -145,11 +126,28 @@ def actors_of(
     for frame in residuals:
         for number, residual in frame.items():
             by_actor.setdefault(number, []).append(residual)
-    actors = [
-        ActorTrack.of(s, by_actor.get(i, []), classes)
-        for i, s in enumerate(summaries)
-        if s["moves"]
-    ]
+    same = ("instance", "first", "last", "points", "speed_m_s", "faces", "confidence")
+    actors = []
+    for number, facts in enumerate(summaries):
+        if not facts["moves"]:
+            continue
+        own = by_actor.get(number, [])
+        count = sum(residual.count for residual in own)
+        moving, static = (
+            round(sum(distances) / count, 4) if count else None
+            for distances in ([r.moving_m for r in own], [r.static_m for r in own])
+        )
+        actors.append(
+            ActorTrack(
+                **{name: facts[name] for name in same},
+                label=classes.names.get(facts["label"], str(facts["label"])),
+                observations=facts["scans"],
+                size_m=tuple(facts["size_m"]),
+                seen_m=tuple(facts["seen_m"]),
+                residual_m=moving,
+                residual_static_m=static,
+            )
+        )
     return tuple(sorted(actors, key=lambda actor: (actor.first, actor.label, actor.instance)))
 
 
@@ -294,7 +292,11 @@ class FrameFacts:
         # counting a label of 2**32 - 1 would take 32 GB
         classes.check(labels, f"{grid}: frame {frame}")
         by_class = np.bincount(labels, minlength=classes.num_channels)
-        inferred = _count_inferred(arrays.get(f"{grid}/flags"), counts)
+        inferred = None
+        if (flags := arrays.get(f"{grid}/flags")) is not None:
+            known = True if counts is None else np.asarray(counts).reshape(-1) > 0
+            marked = np.asarray(flags).reshape(-1) & int(VoxelFlag.INFERRED) > 0
+            inferred = int(np.count_nonzero(marked & known))
         return cls(
             frame,
             digests,
@@ -306,20 +308,6 @@ class FrameFacts:
             residuals or {},
             inferred,
         )
-
-
-def _count_inferred(flags: AnyArray | None, counts: AnyArray | None) -> int | None:
-    """Return the number of known voxels that were inferred, not seen; None if the grid does not
-    say.
-    """
-    if flags is None:
-        return None
-    inferred = (np.asarray(flags).reshape(-1) & int(VoxelFlag.INFERRED)) > 0
-    return int(
-        np.count_nonzero(
-            inferred if counts is None else inferred & (np.asarray(counts).reshape(-1) > 0)
-        )
-    )
 
 
 def sample_frames(numbers: Sequence[int]) -> frozenset[int]:
@@ -553,6 +541,9 @@ class Report:
         frames = tuple(row.frame for row in rows)
         changes = [row.changes for row in rows if row.changes is not None]
         names = sorted({name for row in rows for name in row.digests})
+        counts = [row.inferred for row in rows if row.inferred is not None]
+        known = sum(row.known for row in rows)
+        share = sum(counts) / known if known and len(counts) == len(rows) else None
         return cls(
             grid=grid,
             frames=frames,
@@ -567,7 +558,7 @@ class Report:
             if actors is None
             else actors_of(actors, (row.residuals for row in rows), classes),
             poses=poses,
-            inferred_share=_inferred_share(rows),
+            inferred_share=share,
             holdout=holdout,
             digests={name: _digests(rows, name) for name in names},
             documents={name: FileDigest.of(data) for name, data in sorted(documents.items())},
@@ -576,35 +567,18 @@ class Report:
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain values for JSON."""
+        values, own = asdict(self), f"{self.grid}/"
+        digests = values.pop("digests").items()
         coverage, convergence = self.coverage, self.convergence
-        own = f"{self.grid}/"
-        digests = {name: asdict(value) for name, value in self.digests.items()}
-        return {
-            "format": REPORT_FORMAT,
-            "grid": self.grid,
-            "frames": [list(span) for span in _spans(self.frames)],
-            "settings": dict(self.settings),
-            "coverage": {
-                **asdict(coverage),
-                "known_share": coverage.known_share,
-                "occupied_share": coverage.occupied_share,
-            },
-            "convergence": None
-            if convergence is None
-            else {
-                "left_out": LEFT_OUT,
-                **asdict(convergence),
-                "changed_share": convergence.changed_share,
-            },
-            "actors": None if self.actors is None else [asdict(actor) for actor in self.actors],
-            "poses": None if self.poses is None else asdict(self.poses),
-            "inferred_share": self.inferred_share,
-            "holdout": None if self.holdout is None else dict(self.holdout),
-            "inputs": {name: value for name, value in digests.items() if not name.startswith(own)},
-            "outputs": {name: value for name, value in digests.items() if name.startswith(own)},
-            "documents": {name: asdict(value) for name, value in self.documents.items()},
-            "versions": dict(self.versions),
-        }
+        shares = "known_share", "occupied_share"
+        values["coverage"] |= {name: getattr(coverage, name) for name in shares}
+        if convergence is not None:
+            measured = values["convergence"] | {"changed_share": convergence.changed_share}
+            values["convergence"] = {"left_out": LEFT_OUT, **measured}
+        values["frames"] = _spans(self.frames)
+        values["inputs"] = {name: value for name, value in digests if not name.startswith(own)}
+        values["outputs"] = {name: value for name, value in digests if name.startswith(own)}
+        return {"format": REPORT_FORMAT} | {name: values[name] for name in _KINDS}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], where: str = "report") -> Self:
@@ -625,23 +599,9 @@ class Report:
             )
         with reading(where, "a report", "make it again with `remake=True`"):
             GridSpec.from_params(values["settings"], where)
-            kinds: dict[str, Any] = {
-                "grid": str,
-                "settings": Mapping[str, Any],
-                "coverage": Coverage,
-                "convergence": Convergence | None,
-                "actors": tuple[ActorTrack, ...] | None,
-                "poses": PoseFacts | None,
-                "inferred_share": float | None,
-                "holdout": _HeldOut | None,
-                "inputs": Mapping[str, Digests],
-                "outputs": Mapping[str, Digests],
-                "documents": Mapping[str, FileDigest],
-                "versions": Mapping[str, str],
-            }
-            parts = {name: from_plain(values[name], kind, name) for name, kind in kinds.items()}
+            parts = {name: from_plain(values[name], kind, name) for name, kind in _KINDS.items()}
             digests = {**parts.pop("inputs"), **parts.pop("outputs")}
-            return cls(frames=_frames(values["frames"]), digests=digests, **parts)
+            return cls(**{**parts, "frames": _frames(parts["frames"])}, digests=digests)
 
     def to_json(self) -> bytes:
         """Return the bytes of carlasc-report.json."""
@@ -655,6 +615,24 @@ class Report:
             FormatError: it holds something else.
         """
         return cls.from_dict(parse_json(data, where), where)
+
+
+_KINDS: dict[str, Any] = {
+    "grid": str,
+    "frames": tuple[tuple[int, int], ...],
+    "settings": Mapping[str, Any],
+    "coverage": Coverage,
+    "convergence": Convergence | None,
+    "actors": tuple[ActorTrack, ...] | None,
+    "poses": PoseFacts | None,
+    "inferred_share": float | None,
+    "holdout": _HeldOut | None,
+    "inputs": Mapping[str, Digests],
+    "outputs": Mapping[str, Digests],
+    "documents": Mapping[str, FileDigest],
+    "versions": Mapping[str, str],
+}
+"""The parts of carlasc-report.json, in their order, besides its format."""
 
 
 def short(digest: bytes) -> str:
@@ -680,15 +658,6 @@ def _coverage(rows: list[FrameFacts], settings: Mapping[str, Any], classes: Clas
         mean_votes=round(total / known, 4) if known and total else None,
         votes=tuple(np.trim_zeros(votes, "b").tolist()),
     )
-
-
-def _inferred_share(rows: list[FrameFacts]) -> float | None:
-    """Return the share of the known voxels that were inferred; None if a frame does not say."""
-    counts, known = (
-        [row.inferred for row in rows if row.inferred is not None],
-        sum(row.known for row in rows),
-    )
-    return sum(counts) / known if known and len(counts) == len(rows) else None
 
 
 def _digests(rows: list[FrameFacts], name: str) -> Digests:
@@ -721,16 +690,13 @@ def _spans(frames: tuple[int, ...]) -> list[tuple[int, int]]:
     return [(run[0], run[-1] + 1) for run in runs]
 
 
-def _frames(spans: Any) -> tuple[int, ...]:
+def _frames(spans: tuple[tuple[int, int], ...]) -> tuple[int, ...]:
     """Return the frame numbers of half-open ranges.
 
     Raises:
         ValueError: the ranges are not valid, or have too many frames.
     """
-    ranges = [
-        range(start, stop)
-        for start, stop in from_plain(spans, tuple[tuple[int, int], ...], "frames")
-    ]
+    ranges = [range(start, stop) for start, stop in spans]
     if (
         not all(0 <= span.start <= span.stop for span in ranges)
         or sum(map(len, ranges)) > _MOST_FRAMES

@@ -1,28 +1,46 @@
 """The run over a data set: it makes the grid of every frame, in parallel, and continues an
-unfinished earlier run.
+unfinished earlier run. Each complete sequence gets a report.
+
+A `FrameTask` pickles into a worker, where a frame is made, or an existing frame is measured.
 """
 
 from __future__ import annotations
 
 import os
 import time
-from contextlib import ExitStack
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Iterator, Set
+from collections.abc import Sequence as Series
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 from carlasc.captures.raw import RAW, Capture, find_captures
+from carlasc.core.arrays import AnyArray
+from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
-from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError, MissingDataError
+from carlasc.core.grids import Grid, GridSpec, is_confident
+from carlasc.errors import (
+    ArgumentError,
+    CarlascError,
+    ConflictError,
+    FormatError,
+    MissingDataError,
+    StorageError,
+    reading,
+)
 from carlasc.groundtruth.from_capture import capture_sequences
 from carlasc.groundtruth.from_grid import resampled_sequences
 from carlasc.groundtruth.from_scans.sequences import scan_sequences
-from carlasc.groundtruth.inputs import GridPlan, SequenceInput
+from carlasc.groundtruth.inputs import FrameData, FrameInput, GridPlan, SequenceInput
 from carlasc.groundtruth.options import FromCapture, FromScans, Observe, Voting
-from carlasc.groundtruth.seen import check_views
-from carlasc.groundtruth.work import FrameFailure, SequenceJob, Work
-from carlasc.running.processes import one_pool
-from carlasc.running.spreading import Run
+from carlasc.groundtruth.reporting import Changes, FrameFacts, Report, sample_frames
+from carlasc.groundtruth.seen import check_views, see_voxels
+from carlasc.running.processes import one_pool, run_all
+from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.opening import as_sink
@@ -34,8 +52,9 @@ from carlasc.storage.resuming import (
     agree_metadata,
     check_grid,
     check_name,
+    check_scan,
 )
-from carlasc.storage.sinks import Sink
+from carlasc.storage.sinks import SequenceWriter, Sink
 from carlasc.storage.transport.targets import check_shared
 from carlasc.storage.transport.trees import is_url
 
@@ -271,3 +290,386 @@ def _begin(job: SequenceJob) -> None:
     for document, data in job.documents.items():
         if document != params:
             writer.write_document(document, data)
+
+
+Outputs = dict[str, AnyArray]
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """The result of a task.
+
+    Attributes:
+        task: the task.
+        outputs: the arrays that it made, by field, until they are written.
+        error: why it failed; None if it did not.
+        facts: the facts of the frame for the report.
+    """
+
+    task: FrameTask
+    outputs: Outputs = field(default_factory=dict)
+    error: str | None = None
+    facts: FrameFacts | None = None
+
+
+@dataclass(frozen=True)
+class FrameTask:
+    """One piece of the work of a run: to make a frame, or to measure one that exists, for the
+    report. It holds paths and settings.
+
+    Attributes:
+        number: frame number in the output.
+        frame: the frame; None if it exists, and only an earlier run knew it.
+        plan: the plan of the run.
+        classes: class table of the grid.
+        sampled: whether the frame is also made without a tenth of the scans.
+        existing: where the frame is; None: it is made.
+    """
+
+    number: int
+    frame: FrameInput | None
+    plan: GridPlan
+    classes: ClassTable
+    sampled: bool
+    existing: SequenceWriter | None = None
+
+    def run(self) -> FrameResult:
+        """Do the work, in a worker. The arrays of a new frame are returned, and not written yet."""
+        plan, number, frame = self.plan, self.number, self.frame
+        try:
+            # first, while no outputs take memory
+            thinned = frame.thinned(plan) if self.sampled and frame is not None else None
+            if self.existing is not None:
+                arrays, grid = self._read(self.existing)
+                outputs = Outputs()
+            elif frame is not None:
+                arrays, grid = self._outputs_of(frame.make(plan), frame)
+                outputs = arrays
+            else:
+                raise MissingDataError(f"frame {number}", expected="in the source", found="none")
+            changes = None if thinned is None else Changes.between(grid, thinned)
+            residuals = None if frame is None else frame.residuals()
+            facts = FrameFacts.of(
+                number, arrays, plan.grid, plan.spec, self.classes, changes, residuals
+            )
+        except MemoryError as error:
+            raise CarlascError(
+                str(plan.spec),
+                problem="out of memory",
+                advice="use a coarser grid, or fewer processes (`workers`)",
+            ) from error
+        except (CarlascError, OSError) as error:
+            return FrameResult(self, error=str(error))
+        return FrameResult(self, outputs, facts=facts)
+
+    def _outputs_of(self, data: FrameData, frame: FrameInput) -> tuple[Outputs, Grid]:
+        """Return all arrays to write for a frame, the grid last, and the grid.
+
+        Raises:
+            MissingDataError: the plan needs the certainty of each voxel, and the frame does not
+                have it.
+        """
+        plan, voting, where = self.plan, self.plan.voting, f"frame {self.number}"
+        labels, counts, evidence = data.grid.labels, data.grid.counts, data.evidence
+        if plan.needs_evidence and evidence is None:
+            raise MissingDataError(where, expected="how certain each voxel is", found="nothing")
+        if voting.min_confidence and counts is not None and evidence is not None:
+            confident = is_confident(evidence.occupied, voting.min_confidence)
+            labels, counts = labels * confident, counts * confident
+        parts: Outputs = {"labels": labels}
+        parts |= {} if counts is None else {"counts": counts}
+        if voting.keep and data.votes is not None:
+            parts["votes"] = data.votes.to_sparse()
+        if voting.keep_evidence and evidence is not None:
+            parts |= {part: getattr(evidence, part) for part in layout.EVIDENCE_FIELDS}
+        if voting.keep_actors and data.actors is not None:
+            actors = data.actors.within(labels > 0)  # confidence may have made voxels unknown
+            parts |= {part: getattr(actors, part) for part in layout.ACTOR_FIELDS}
+        if voting.keep_seen:
+            parts["seen"] = see_voxels(labels > 0, plan.spec, frame.views(), data.boxes)
+        of_grid = {f"{plan.grid}/{part}": array for part, array in parts.items()}
+        return {**data.fields, **of_grid}, Grid(plan.spec, labels, counts)
+
+    def _read(self, writer: SequenceWriter) -> tuple[Outputs, Grid]:
+        """Return the arrays of a frame that exists, and its grid."""
+        plan, arrays = self.plan, Outputs()
+        names = (*layout.SCAN_FIELDS, *(f"{plan.grid}/{part}" for part in layout.GRID_FIELDS))
+        with reading(f"frame {self.number}", "a grid with labels and counts"):
+            for name in names:
+                if writer.has(name, self.number):
+                    array = writer.read(name, self.number)
+                    arrays |= {} if array is None else {name: array}
+            labels, counts = (
+                arrays[f"{plan.grid}/{part}"].reshape(plan.spec.size)
+                for part in ("labels", "counts")
+            )
+        return arrays, Grid(plan.spec, labels, counts)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Tasks that a worker runs one after another: the frames that are stored together, or the
+    measurement of one frame.
+
+    Attributes:
+        writer: where the frames are written.
+        tasks: the tasks.
+    """
+
+    writer: SequenceWriter
+    tasks: tuple[FrameTask, ...]
+
+
+def run_batch(batch: Batch) -> list[FrameResult]:
+    """Run the tasks of a batch, and write the frames if the writer works in workers.
+
+    Raises:
+        ConflictError: a scan exists already, and differs from that of this run.
+        StorageError: nothing can be written, so all other batches would fail too.
+    """
+    done: list[FrameResult] = []
+    for task in batch.tasks:  # in Python 3.11, a comprehension is a level of calls
+        done.append(task.run())  # noqa: PERF401
+    if not batch.writer.concurrent:
+        return done
+    try:
+        write_frames(batch.writer, done)
+    except (ConflictError, StorageError):
+        raise  # every other batch would raise the same
+    except (CarlascError, OSError) as error:
+        done = [replace(result, error=result.error or str(error), facts=None) for result in done]
+    return [replace(result, outputs={}) for result in done]
+
+
+def fail_batch(batch: Batch, message: str) -> list[FrameResult]:
+    """Return the result of a batch that no worker could finish."""
+    return [FrameResult(task, error=message) for task in batch.tasks]
+
+
+def write_frames(writer: SequenceWriter, results: Series[FrameResult]) -> None:
+    """Write the frames that were made. Scan fields that exist already must be equal to this run's.
+
+    Raises:
+        ConflictError: they differ.
+    """
+    frames: dict[int, Outputs] = {}
+    for done in results:
+        if done.outputs:
+            number = done.task.number
+            frames[number] = {
+                name: array
+                for name, array in done.outputs.items()
+                if name not in layout.SCAN_FIELDS
+                or not (writer.has(name, number) and check_scan(writer, name, number, array))
+            }
+    if frames:
+        writer.write_frames(frames)
+
+
+@dataclass(frozen=True)
+class FrameFailure:
+    """A frame that could not be made.
+
+    Attributes:
+        sequence: location of its sequence in the source.
+        frame: its number in the source.
+        message: the error, in one line.
+    """
+
+    sequence: str
+    frame: int
+    message: str
+
+
+@dataclass(frozen=True)
+class SequenceJob:
+    """The job of a run for one sequence: inputs, writer, and documents to write first."""
+
+    path: str
+    inputs: SequenceInput
+    plan: GridPlan
+    writer: SequenceWriter
+    documents: dict[str, bytes]
+    params: dict[str, Any]
+    replaces: bool
+
+    @cached_property
+    def numbers(self) -> frozenset[int]:
+        """The numbers of the frames in the output."""
+        return frozenset(frame.number for frame in self.inputs.frames)
+
+    def block_of(self, number: int) -> int:
+        """Return the block of a frame. The frames of a block are stored together."""
+        return number // self.writer.block
+
+    def announce(self) -> None:
+        """Announce the fields and frames to a store that reserves space."""
+        frames: dict[str, list[int]] = {name: sorted(self.numbers) for name in self.plan.fields()}
+        for frame in self.inputs.frames:
+            for name in frame.fields():
+                frames.setdefault(name, []).append(frame.number)
+        points = self.inputs.most_points() if self.writer.block > 1 else None
+        self.writer.expect(frames, {"points": points} if points else None)
+
+    def missing(self) -> set[int]:
+        """Return the frames that lack a file at this moment: other commands may write at the same
+        time.
+        """
+        self.writer.refresh()
+        has, grid = self.writer.has, self.plan.fields()
+        frames = self.inputs.frames
+        return {
+            frame.number
+            for frame in frames
+            if not all(has(name, frame.number) for name in (*frame.fields(), *grid))
+        }
+
+    def report(self) -> Report | None:
+        """Return the report of an earlier run with the same settings; None without one."""
+        name = layout.report_file(self.plan.grid)
+        data = self.writer.read_document(name)
+        try:
+            report = None if data is None else Report.from_json(data, name)
+        except FormatError:
+            return None
+        return report if report is not None and report.settings == self.params else None
+
+    @property
+    def reported(self) -> frozenset[int]:
+        """The frames of the report: those of this run, and those of the existing report."""
+        report = self.report()
+        return self.numbers if report is None else self.numbers | set(report.frames)
+
+    def tasks(self, numbers: Set[int], existing: SequenceWriter | None = None) -> list[FrameTask]:
+        """Return a task for each of some frames; `existing`: where they are already."""
+        sampled, inputs = set(sample_frames(sorted(self.reported))), self.inputs
+        known = {frame.number: frame for frame in inputs.frames}
+        return [
+            FrameTask(
+                number,
+                known.get(number) or inputs.frame(number),
+                self.plan,
+                inputs.metadata.classes,
+                number in sampled,
+                existing,
+            )
+            for number in sorted(numbers)
+        ]
+
+    def write_report(self, results: Series[FrameResult]) -> None:
+        """Write the report, if anything was made or measured."""
+        facts = [done.facts for done in results if done.facts is not None]
+        grid, writer = self.plan.grid, self.writer
+        names = (layout.POSES, layout.TIMES, layout.METADATA, layout.params_file(grid))
+        documents = {
+            name: data for name in names if (data := writer.read_document(name)) is not None
+        }
+        if facts:
+            inputs = self.inputs
+            classes, actors, poses = (
+                inputs.metadata.classes,
+                inputs.summaries(),
+                inputs.pose_facts(),
+            )
+            report = Report.make(
+                grid, facts, self.params, classes, documents, actors=actors, poses=poses
+            )
+            writer.write_document(layout.report_file(grid), report.to_json())
+
+
+@dataclass
+class Work:
+    """The work of a run, or of a part of it.
+
+    Attributes:
+        jobs: the sequences.
+        plan: the plan of the run.
+        spread: how the work is spread. Frames that are stored together are in one part.
+        failures: frames that could not be made.
+        wanted: number of frames to make.
+        skipped: number of frames of this part that exist already.
+        has_written: whether a frame or a report was written.
+    """
+
+    jobs: Series[SequenceJob]
+    plan: GridPlan
+    spread: Run
+    failures: list[FrameFailure] = field(default_factory=list)
+    wanted: int = 0
+    skipped: int = 0
+    has_written: bool = False
+
+    def run(self) -> list[FrameFailure]:
+        """Make the missing frames, and return the frames that could not be made.
+
+        Sequences follow each other without a pause: the next sequence is prepared while the last
+        frames of one are made.
+        """
+        dealt = self._deal()
+        ours = [job.missing() & numbers for job, numbers in zip(self.jobs, dealt, strict=True)]
+        self.wanted = sum(map(len, ours))
+        self.skipped = sum(map(len, dealt)) - self.wanted
+        passes = sum(
+            job.inputs.steps_before for job, missing in zip(self.jobs, ours, strict=True) if missing
+        )
+        steps = StepCounter(self.spread.progress, self.skipped + self.wanted + passes, self.skipped)
+        steps(0)
+        under_way: deque[SequenceJob] = deque()  # the job of each batch, in order
+
+        def batches() -> Iterator[Batch]:
+            for job, missing in zip(self.jobs, ours, strict=True):
+                if missing:
+                    job.inputs.prepare(job.writer, self.spread, steps)
+                for batch in _batches(job, job.tasks(missing)):
+                    under_way.append(job)
+                    yield batch
+
+        made: dict[int, list[FrameResult]] = {id(job): [] for job in self.jobs}
+        with closing(run_all(run_batch, batches(), self.spread, lost=fail_batch)) as results:
+            for job, missing in zip(self.jobs, ours, strict=True):
+                while len(made[id(job)]) < len(missing):
+                    done = next(results)
+                    # frames of a writer that does not work in workers
+                    write_frames(under_way.popleft().writer, done)
+                    made[id(job)] += [replace(result, outputs={}) for result in done]
+                    steps(len(done))
+                self._finish(job, made.pop(id(job)), steps)
+        return self.failures
+
+    def _deal(self) -> list[set[int]]:
+        """Return the frames of each sequence that belong to the part."""
+        blocks = sorted(
+            {(n, job.block_of(number)) for n, job in enumerate(self.jobs) for number in job.numbers}
+        )
+        dealt = set(self.spread.part.take(blocks))
+        return [
+            {i for i in job.numbers if (n, job.block_of(i)) in dealt}
+            for n, job in enumerate(self.jobs)
+        ]
+
+    def _finish(self, job: SequenceJob, made: list[FrameResult], steps: StepCounter) -> None:
+        """Note the failures, and write the report; if other parts make frames of the sequence, the
+        last part writes it.
+        """
+        self.has_written |= bool(made)
+        for done in made:
+            if done.task.frame is not None and done.error is not None:
+                frame = done.task.frame.source_frame
+                self.failures.append(FrameFailure(job.inputs.location, frame, done.error))
+        report = job.report()
+        is_reported = report is not None and set(report.frames) >= job.numbers
+        if (not made and is_reported) or (self.spread.part.count > 1 and job.missing()):
+            return
+        if not made:
+            job.inputs.prepare(job.writer, self.spread, StepCounter(None))
+        self.has_written = True
+        tried = {done.task.number for done in made}
+        measured = _batches(job, job.tasks(job.reported - tried, job.writer))
+        with closing(run_all(run_batch, measured, self.spread, lost=fail_batch)) as results:
+            job.write_report([*made, *(done for batch in results for done in batch)])
+
+
+def _batches(job: SequenceJob, tasks: Series[FrameTask]) -> Iterator[Batch]:
+    """Yield tasks in batches; the frames that are stored together are in one batch."""
+    for _, group in groupby(tasks, key=lambda task: job.block_of(task.number)):
+        yield Batch(job.writer, tuple(group))

@@ -106,16 +106,12 @@ def see_voxels(
         if place is None:
             continue
         camera_T_scan = invert(place)
-        ahead = np.flatnonzero(_in_front(centers, camera_T_scan, camera.model == "fisheye"))
+        depth = centers @ camera_T_scan[2, :3] + camera_T_scan[2, 3]
+        ahead = np.flatnonzero(depth > (-np.inf if camera.model == "fisheye" else 0))
         pixels = camera.project(transform_points(camera_T_scan, centers[ahead]))
         voxels = ahead[camera.contains(pixels)]
         _mark_seen(voxels, (place[:3, 3] - lower) / edge, solid, np.uint8(1 << bit), seen)
     return seen.reshape(spec.size)
-
-
-def _in_front(centers: FloatArray, camera_T_scan: Transform, is_wide: bool) -> BoolArray:
-    depth = centers @ camera_T_scan[2, :3] + camera_T_scan[2, 3]
-    return np.asarray(depth > (-np.inf if is_wide else 0))
 
 
 @cached

@@ -16,7 +16,6 @@ from carlasc.core.geometry import check_rigid
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, CarlascError
 from carlasc.groundtruth.from_scans.feed import ScanFeed
-from carlasc.groundtruth.heights import ground_of
 from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.reporting import Report, digest_of, short
 from carlasc.inspection.agreement import GridDiagnosis, GridEvidence, GroundBelow, check_actors
@@ -32,6 +31,7 @@ from carlasc.inspection.findings import (
 from carlasc.inspection.image_alignment import compare_images, judge_images
 from carlasc.inspection.pose_quality import check_poses, check_times, describe_mounting
 from carlasc.inspection.structure import static_structure
+from carlasc.motion.ground import ground_of
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout

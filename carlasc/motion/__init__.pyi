@@ -8,7 +8,7 @@ from .evidence import HORIZON_S as HORIZON_S
 from .evidence import EvidenceScan as EvidenceScan
 from .evidence import FreeSpaceEvidence as FreeSpaceEvidence
 from .evidence import find_evidence as find_evidence
-from .found_actors import follow_actors as follow_actors
+from .found_actors import ActorFollower as ActorFollower
 from .ground import ground_height as ground_height
 from .ground import ground_points as ground_points
 from .linking import Chain as Chain

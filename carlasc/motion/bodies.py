@@ -291,10 +291,6 @@ def _without_neighbours(extent: Extent) -> Extent:
     return replace(extent, lower=lower, upper=upper)
 
 
-def _is_lorry(length: float, width: float, height: float) -> bool:
-    return width > _LORRY_WIDE_M or height > _LORRY_HIGH_M or length > _LORRY_LONG_M
-
-
 def _table(extent: Extent, axis: int) -> float:
     """Return the usual length or width of an actor whose other size is known."""
     length, width, height = extent.size.tolist()
@@ -324,7 +320,7 @@ def usual_shell(lower: FloatArray, upper: FloatArray, extent: Extent) -> Float32
     lower, upper = lower + _INSET_M, upper - _INSET_M
     if width < _ACTORS_WIDE_M or height < _LOWEST_M or not any(extent.known):
         return np.empty((0, 3), np.float32)
-    if _is_lorry(length, width, height):
+    if width > _LORRY_WIDE_M or height > _LORRY_HIGH_M or length > _LORRY_LONG_M:
         return _box_surface(lower + (0, 0, _CLEARANCE_M), upper)
     belt = lower[2] + _BELT * height
     body = _box_surface(lower + (0, 0, _CLEARANCE_M), np.array([upper[0], upper[1], belt]))

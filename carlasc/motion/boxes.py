@@ -40,6 +40,8 @@ _JUMP_M, _MAX_SPEED_M_S = (
     1.5,
     40.0,
 )
+# points of other classes than the track's count as ground up to this height in its box
+_FLOOR_M = 0.15
 _ROUNDING_M = 0.01  # more than the rounding of a position
 
 
@@ -114,7 +116,6 @@ def segment_by_boxes(
     tracks: Sequence[Track],
     *,
     ground: Collection[int] = (),
-    floor_m: float = 0.15,
 ) -> list[Segment]:
     """Return the points of a scan that are in the boxes of tracks.
 
@@ -127,8 +128,6 @@ def segment_by_boxes(
         world_T_sensor: (4, 4) pose of the scan.
         tracks: the tracks. Tracks that do not extend to the frame have no segment.
         ground: ids of the ground classes.
-        floor_m: points of other classes than the track's count as ground up to this height above
-            the bottom of its box, metres.
 
     Returns:
         The segments of the tracks that have points in the scan, in the order of the tracks. Each
@@ -153,9 +152,7 @@ def segment_by_boxes(
             there = transform_points(sensor_T_world, pose[:3, 3])
             near = np.flatnonzero((np.abs(x - there[0]) <= reach) & (np.abs(y - there[1]) <= reach))
             points = transform_points(world_T_sensor, scan.points[candidates[near]])
-            members = near[
-                _inside(track, pose, points, None if labels is None else labels[near], floor_m)
-            ]
+            members = near[_inside(track, pose, points, None if labels is None else labels[near])]
             owners[candidates[members]] = index
     segments = []
     for index, track in enumerate(tracks):
@@ -174,7 +171,6 @@ def _inside(
     pose: Transform,
     points: FloatArray,
     labels: LabelArray | None,
-    floor_m: float,
 ) -> IntArray:
     """Return the indices of the (M, 3) points, world, that are in a track's box at a pose and above
     its ground.
@@ -183,7 +179,7 @@ def _inside(
     near = np.flatnonzero(np.abs(points[:, 1] - pose[1, 3]) <= reach)
     body = transform_points(invert(pose), points[near])
     inside = ((body >= track.lower) & (body <= track.upper)).all(axis=1)
-    above = body[:, 2] > track.lower[2] + BODY_MARGIN_M + floor_m
+    above = body[:, 2] > track.lower[2] + BODY_MARGIN_M + _FLOOR_M
     if labels is not None:
         above |= labels[near] == track.label
     return near[inside & above]

@@ -5,7 +5,7 @@ They are followed from scan to scan.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -64,64 +64,63 @@ class FoundActor:
     confidence: float
 
 
-def follow_actors(
-    evidence: Iterable[FreeSpaceEvidence],
-    moved: dict[int, IntArray],
-    *,
-    deformable: Collection[int] = (),
-    first_instance: int = 1,
-    default_label: int = 0,
-    own: list[FloatArray] | None = None,
-) -> Iterator[FoundActor]:
-    """Follow what moved from scan to scan, and yield each actor that has enough evidence, after its
-    last observation.
+class ActorFollower:
+    """Follows what moved from scan to scan.
 
-    Args:
-        evidence: the evidence of each scan, in order of time.
-        moved: filled with the (M,) indices of the points that moved, tracked or not, by frame.
-        deformable: classes of actors that change their shape as they move. Without labels, small
-            actors do.
-        first_instance: number of the first actor; others follow.
-        default_label: class of actors without labels.
-        own: filled with the (6,) lower and upper corners of the parts of the recording vehicle,
-            metres, sensor frame.
-
-    Yields:
-        The actors, numbered in the order of their last observations.
+    Attributes:
+        moved: (M,) indices of the points that moved, tracked or not, by frame.
+        own: (6,) lower and upper corners of the parts of the recording vehicle, metres, sensor
+            frame.
     """
-    own = [] if own is None else own
-    alive: list[_ActorChain] = []
-    number = first_instance
-    for scan in evidence:
-        moved[scan.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
-        ended = [chain for chain in alive if scan.seconds - chain.last.seconds > _MAX_GAP_S]
-        for actor in _tracked(ended, deformable, number, default_label, own):
-            yield actor
-            number += 1
-        alive = [chain for chain in alive if scan.seconds - chain.last.seconds <= _MAX_GAP_S]
-        _link(scan, alive, deformable)
-    yield from _tracked(alive, deformable, number, default_label, own)
 
+    def __init__(
+        self,
+        *,
+        deformable: Collection[int] = (),
+        first_instance: int = 1,
+        default_label: int = 0,
+    ) -> None:
+        """Start before the first scan.
 
-def _tracked(
-    chains: list[_ActorChain],
-    deformable: Collection[int],
-    number: int,
-    default_label: int,
-    own: list[FloatArray],
-) -> Iterator[FoundActor]:
-    """Yield the actors of the chains with enough evidence, numbered from `number`, and add parts of
-    the recording vehicle to `own`.
-    """
-    for chain in chains:
-        part = chain.own_vehicle()
-        if part is not None:
-            own.append(part)
-            continue
-        actor = chain.actor(deformable, number, default_label)
-        if actor is not None:
-            yield actor
-            number += 1
+        Args:
+            deformable: classes of actors that change their shape as they move. Without labels,
+                small actors do.
+            first_instance: number of the first actor; others follow in the order of their last
+                observations.
+            default_label: class of actors without labels.
+        """
+        self.moved: dict[int, IntArray] = {}
+        self.own: list[FloatArray] = []
+        self._deformable, self._label, self._number = deformable, default_label, first_instance
+        self._alive: list[_ActorChain] = []
+
+    def add(self, scan: FreeSpaceEvidence) -> list[FoundActor]:
+        """Add the evidence of the next scan, and return the actors with enough evidence that ended
+        before it.
+        """
+        self.moved[scan.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
+        before, self._alive = self._alive, []
+        ended = list[_ActorChain]()
+        for one in before:
+            over = scan.seconds - one.last.seconds > _MAX_GAP_S
+            (ended if over else self._alive).append(one)
+        actors = self._actors(ended)
+        _link(scan, self._alive, self._deformable)
+        return actors
+
+    def finish(self) -> list[FoundActor]:
+        """Return the actors that have not ended."""
+        return self._actors(self._alive)
+
+    def _actors(self, chains: list[_ActorChain]) -> list[FoundActor]:
+        actors = []
+        for one in chains:
+            if (part := one.own_vehicle()) is not None:
+                self.own.append(part)
+            elif actor := one.actor(self._deformable, self._number, self._label):
+                actors.append(actor)
+                self._number += 1
+        return actors
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,8 @@ the step from this slope is possible for a road or a kerb. Elsewhere the ground 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,6 +21,7 @@ from carlasc.core.arrays import (
     FloatArray,
     Int32Array,
     IntArray,
+    LabelArray,
 )
 from carlasc.core.cells import fast_azimuth
 from carlasc.core.compiling import cached
@@ -221,3 +224,65 @@ def _follow(lowest: FloatArray, heights: FloatArray) -> None:
         slope = (at - heights[before]) / _TREND_M if before >= 0 else 0.0
     for k in range(last + 1, _RINGS):
         heights[k] = at
+
+
+_OF_EACH = 1000  # number of heights that represent one drive
+_REACH_M = 25.0  # greatest horizontal distance of ground points
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The ground around a sensor.
+
+    Attributes:
+        heights_m: z of ground points around the sensor, sensor frame; at least one.
+        below_m: height of the sensor above the ground under it.
+    """
+
+    heights_m: Float32Array
+    below_m: float
+
+
+def ground_of(
+    points: Float32Array, labels: LabelArray | None, ground: Collection[int]
+) -> Float32Array:
+    """Return the points on the ground: by their labels, or by their heights if they have none.
+
+    Args:
+        points: (N, 3) metres, in the frame of the sensor.
+        labels: (N,) class ids, or None.
+        ground: ids of the ground classes; without any, heights decide.
+    """
+    on_ground = (
+        ground_points(points) if labels is None or not ground else np.isin(labels, sorted(ground))
+    )
+    return points[on_ground]
+
+
+def find_ground(scans: Iterable[Float32Array], reach_m: float = _REACH_M) -> Ground | None:
+    """Return the ground in some scans, (N, 3) or (N, 4), within a horizontal distance of the
+    sensor; None if there is none.
+    """
+    heights: list[Float32Array] = []
+    near: list[float] = []
+    for points in scans:
+        ground = points[ground_points(points), :3]
+        distance = np.hypot(ground[:, 0], ground[:, 1])
+        heights.append(ground[distance < reach_m, 2])
+        below = ground_height(points)
+        near += [below] if np.isfinite(below) else []
+    if not near or not sum(map(len, heights)):
+        return None
+    return Ground(np.concatenate(heights), -float(np.median(near)))
+
+
+def joined(grounds: Sequence[Ground]) -> Ground:
+    """Return the ground in the scans of one or more drives.
+
+    Each drive has the same weight, for any number of points.
+    """
+    if len(grounds) == 1:
+        return grounds[0]
+    shares = np.linspace(0, 1, _OF_EACH)
+    heights = [np.quantile(ground.heights_m, shares).astype(np.float32) for ground in grounds]
+    return Ground(np.concatenate(heights), float(np.median([ground.below_m for ground in grounds])))

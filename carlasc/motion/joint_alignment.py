@@ -44,20 +44,11 @@ _STEEP, _SLANTED = 0.8, 0.3  # |z| of the normals of ground, and of slopes
 _PER_DIRECTION = 300  # greatest number of planes per direction: more add little
 _SUMS = 10  # 1, x, y, z, xx, xy, xz, yy, yz, zz
 _SQUARES = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])
+# Standard deviations of the prior, metres and radians: of a pose about the given pose, and of the
+# change of a pose about the change of the previous one; as weights.
+_PRIOR = np.array([2.0, math.radians(4.0), 0.1, math.radians(0.5)]) ** -2.0
 _MIX = np.int64(-7046029254386353131)  # spreads the keys of cells over a hash table
 _BITS = 21  # of the index of a cell along an axis; indices that differ by 2^21 share a key
-
-
-class PosePrior(NamedTuple):
-    """The prior of poses: standard deviations of a position, metres, and of a rotation, radians.
-
-    Attributes:
-        to_given: of a pose about the given pose.
-        to_neighbour: of the change of a pose about the change of the previous one.
-    """
-
-    to_given: tuple[float, float] = (2.0, math.radians(4.0))
-    to_neighbour: tuple[float, float] = (0.1, math.radians(0.5))
 
 
 class AlignmentPass(NamedTuple):
@@ -100,7 +91,6 @@ def align(
     start: FloatArray,
     given: FloatArray,
     fixed: int = 0,
-    prior: PosePrior = PosePrior(),  # noqa: B008 (a tuple)
 ) -> FloatArray:
     """Return the poses under which scans agree best.
 
@@ -110,7 +100,6 @@ def align(
             most some decimetres.
         given: (F, 4, 4) poses of the prior, which hold where the scans do not determine a pose.
         fixed: number of scans at the beginning whose poses stay.
-        prior: the standard deviations of the prior.
 
     Returns:
         (F, 4, 4) world_T_sensor.
@@ -130,14 +119,7 @@ def align(
                 chosen = _choose(normals, thickness)
                 slopes = _determined(normals, thickness, chosen)
                 add_planes(block, poses, normals, slopes, thickness, chosen, fixed, matrix, right)
-            add_given(
-                poses,
-                given,
-                np.array([*prior.to_given, *prior.to_neighbour]) ** -2.0,
-                fixed,
-                matrix,
-                right,
-            )
+            add_given(poses, given, _PRIOR, fixed, matrix, right)
             move(poses, solve_positive(matrix, right).reshape(-1, 6), fixed)
     return poses
 

@@ -48,7 +48,6 @@ def estimate_poses(
     times: Sequence[float] | AnyFloatArray | None = None,
     max_range_m: float = 100.0,
     min_range_m: float = 0.0,
-    voxel_size_m: float | None = None,
     total: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> FloatArray:
@@ -62,7 +61,6 @@ def estimate_poses(
         times: (F,) seconds, increasing: the time of each frame; None for frames at 10 Hz.
         max_range_m: farther points are not used.
         min_range_m: nearer points are not used.
-        voxel_size_m: voxel size of the map; None for a hundredth of the range, as in KISS-ICP.
         total: number of scans, for `progress`.
         progress: called with the number of finished scans and the number of all scans.
 
@@ -76,9 +74,7 @@ def estimate_poses(
     """
     poses: list[Transform] = []
     limits = {"max_range_m": max_range_m, "min_range_m": min_range_m}
-    for pose in follow_scans(
-        _usable(scans, seconds), times=times, voxel_size_m=voxel_size_m, **limits
-    ):
+    for pose in follow_scans(_usable(scans, seconds), times=times, **limits):
         poses.append(pose)
         if progress:
             progress(len(poses), total or len(poses))
@@ -91,7 +87,6 @@ def follow_scans(
     times: Sequence[float] | AnyFloatArray | None = None,
     max_range_m: float = 100.0,
     min_range_m: float = 0.0,
-    voxel_size_m: float | None = None,
 ) -> Iterator[Transform]:
     """Yield the pose of every scan of a drive, in order, as soon as it is known.
 
@@ -118,7 +113,6 @@ def follow_scans(
             may grow during the run, if it has the time of a scan before the scan is read.
         max_range_m: farther points are not used.
         min_range_m: nearer points are not used.
-        voxel_size_m: voxel size of the map; None for a hundredth of the range, as in KISS-ICP.
 
     Yields:
         (4, 4) first_T_sensor.
@@ -133,7 +127,7 @@ def follow_scans(
     config.registration.max_num_threads = (
         1  # several threads sum in a different order each time, which changes the last digits
     )
-    config.mapping.voxel_size = voxel_size_m if voxel_size_m is not None else max_range_m / 100.0
+    config.mapping.voxel_size = max_range_m / 100.0
     scans = iter(scans)
     start = list(islice(scans, _START))
     begin = partial(pipeline.KissICP, config)

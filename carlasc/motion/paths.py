@@ -284,33 +284,27 @@ def _shift_of_ends(before: FloatArray, now: FloatArray, velocity: FloatArray) ->
     if speed < _SLOW_M_S or min(len(before), len(now)) < _END_POINTS:
         return np.empty((0, 4))
     ahead = np.array([velocity[0], velocity[1], 0.0]) / speed
-    shifts = []
-    for direction in (ahead, np.array([-ahead[1], ahead[0], 0.0]), np.array([0.0, 0.0, 1.0])):
-        (low, high), (low_now, high_now) = (
-            ends((points * direction).sum(axis=1)) for points in (before, now)
-        )
-        if abs((high_now - low_now) - (high - low)) < _SAME_WIDTH_M:
-            shifts.append(np.append(direction, (low_now + high_now) / 2 - (low + high) / 2))
-    return np.array(shifts).reshape(-1, 4)
-
-
-def ends(values: FloatArray) -> tuple[float, float]:
-    """Return the 2 % and 98 % quantiles of (N,) values.
-
-    `np.quantile` returns the same and takes ten times as long.
-    """
-    places = [(len(values) - 1) * quantile for quantile in (0.02, 0.98)]
-    after = [min(int(place) + 1, len(values) - 1) for place in places]
-    ranked = np.partition(values, [int(places[0]), after[0], int(places[1]), after[1]])
-    low, high = (
-        _between(float(ranked[int(place)]), float(ranked[upper]), place - int(place))
-        for place, upper in zip(places, after, strict=True)
+    directions = np.stack([ahead, [-ahead[1], ahead[0], 0.0], [0.0, 0.0, 1.0]])
+    (low, high), (low_now, high_now) = (
+        ends((points[:, None] * directions).sum(axis=2)) for points in (before, now)
     )
+    same = np.abs((high_now - low_now) - (high - low)) < _SAME_WIDTH_M
+    moved = (low_now + high_now) / 2 - (low + high) / 2
+    return np.column_stack([directions, moved])[same]
+
+
+def ends(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the 2 % and 98 % quantiles of each column of (N, K) values.
+
+    `np.quantile` returns the same and takes much longer.
+    """
+    places = (len(values) - 1) * np.array([[0.02], [0.98]])
+    before = places.astype(np.int64)
+    after, share = np.minimum(before + 1, len(values) - 1), places - before
+    ranked = np.sort(values, axis=0)
+    low, high = ranked[before[:, 0]], ranked[after[:, 0]]
+    low, high = np.where(share < 0.5, low + (high - low) * share, high - (high - low) * (1 - share))
     return low, high
-
-
-def _between(low: float, high: float, share: float) -> float:
-    return low + (high - low) * share if share < 0.5 else high - (high - low) * (1 - share)
 
 
 def middles_of(observations: Sequence[FloatArray]) -> FloatArray:

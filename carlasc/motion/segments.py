@@ -21,6 +21,7 @@ _REACH_M = 2.0
 _BESIDE_M = 1.0
 _SAME_VELOCITY_M_S = 0.5  # greatest difference of flow within one rigid actor
 
+_REST_M = 0.5  # margin around an actor in which its static points are searched for
 LINKED_M_S = 2.0  # maximum change of an actor's velocity between two segments
 
 
@@ -165,11 +166,11 @@ class StaticPoints:
         """Return an object without points."""
         return cls(frame, np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)))
 
-    def segment_at(self, segment: Segment, margin_m: float = 0.5) -> Segment | None:
+    def segment_at(self, segment: Segment) -> Segment | None:
         """Return the static points of a segment's class at its position; None if the segment has
         far more points.
         """
-        lower, upper = segment.points.min(axis=0) - margin_m, segment.points.max(axis=0) + margin_m
+        lower, upper = segment.points.min(axis=0) - _REST_M, segment.points.max(axis=0) + _REST_M
         own = np.flatnonzero(
             (self.labels == segment.label)
             & ((self.points > lower) & (self.points < upper)).all(axis=1)

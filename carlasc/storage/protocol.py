@@ -346,13 +346,12 @@ class Sequence(ABC):
         """
         wanted = {*layout.point_fields(), "boxes"} if fields is None else set(fields)
         boxes = self.boxes(frame) if "boxes" in wanted else None
-        wanted -= {"boxes", "remission"}
+        wanted = wanted & self.fields() - {"boxes", "remission"}
         points = self.read("points", frame)
-        read = {
-            name: self.read(name, frame)
-            for name in layout.point_fields()
-            if name in wanted & self.fields()
-        }
+        read = {}
+        for name in layout.point_fields():  # in Python 3.11, a comprehension is a level of calls
+            if name in wanted:
+                read[name] = self.read(name, frame)
         own = {name: read.pop(name) for name in ("labels", "flow", "instances") if name in read}
         with within(f"{self.location}: frame {frame}"):
             return Scan(points[:, :3], remission=points[:, 3], **own, others=read, boxes=boxes)

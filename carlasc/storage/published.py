@@ -97,7 +97,11 @@ class PublishedSequence(Sequence):
 
     def fields(self) -> frozenset[str]:
         """Return the fields with at least one frame."""
-        return frozenset(name for name in self._listing if len(self.frames(name)))
+        present = set()
+        for name in self._listing:  # in Python 3.11, a comprehension is a level of calls
+            if len(self.frames(name)):
+                present.add(name)
+        return frozenset(present)
 
     def frames(self, field: str) -> IntArray:
         """Return the frames of a field. Its folder is listed once."""

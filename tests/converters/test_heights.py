@@ -10,8 +10,9 @@ import carlasc
 from carlasc.converting import LayoutOptions, Sensor, convert
 from carlasc.core import GridSpec, translation
 from carlasc.groundtruth import FromScans, GridOptions
-from carlasc.groundtruth.heights import find_ground, fit_to_ground, share_below
+from carlasc.groundtruth.options import fit_to_ground, share_below
 from carlasc.motion import MotionOptions
+from carlasc.motion.ground import find_ground
 from carlasc.running import Run
 from carlasc.testing import SimulatedDrive
 

@@ -27,7 +27,7 @@ def filled(folder, every, most_rows):
     folder.mkdir()
     cells, most = GrowingCells(folder, CELL_M, most_rows), 0
     for points, labels in every:
-        cells.add(split(*rows_of_scan(points, labels, None, np.full(len(points), STATIC), CELL_M)))
+        cells.add(split(*rows_of_scan(points, labels, None, STATIC, CELL_M)))
         most = max(most, cells._held)
     cells.finish()
     return np.concatenate(list(cells.points())), most
@@ -67,10 +67,10 @@ def test_scans_vote_once_and_the_lowest_of_equal_classes_wins(tmp_path):
 
 
 def test_probabilities_weigh_votes(tmp_path):
-    here, groups = np.full((2, 3), 0.01), np.full(2, STATIC)
+    here = np.full((2, 3), 0.01)
     rows = [
         rows_of_scan(
-            here, np.full(2, label, np.uint16), np.full(2, sure, np.float32), groups, CELL_M
+            here, np.full(2, label, np.uint16), np.full(2, sure, np.float32), STATIC, CELL_M
         )
         for label, sure in ((1, 0.3), (1, 0.3), (2, 0.9))
     ]
@@ -84,7 +84,5 @@ def test_probabilities_weigh_votes(tmp_path):
 
 
 def test_a_scan_without_points_adds_nothing(tmp_path):
-    made = split(
-        *rows_of_scan(np.empty((0, 3)), np.empty(0, np.uint16), None, np.empty(0, np.int64), CELL_M)
-    )
+    made = split(*rows_of_scan(np.empty((0, 3)), np.empty(0, np.uint16), None, STATIC, CELL_M))
     assert made == []

@@ -8,7 +8,7 @@ from helpers.scenes import passing_car
 import carlasc
 from carlasc import FromScans, Run
 from carlasc.errors import FormatError
-from carlasc.groundtruth.from_scans import motion_pass
+from carlasc.groundtruth.from_scans import sequences
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
 from carlasc.motion import Extent, MotionOptions, PoseOptions, Track
 from carlasc.motion.tracks import MovingActors
@@ -135,7 +135,7 @@ def passes(monkeypatch):
         made.append(1)
         return find_actors(*args, **options)
 
-    monkeypatch.setattr(motion_pass, "find_actors", find)
+    monkeypatch.setattr(sequences, "find_actors", find)
     return made
 
 

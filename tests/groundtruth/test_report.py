@@ -153,7 +153,7 @@ def test_parts_of_a_sequence_add_up_in_the_report(street, made, tmp_path):
 
 def test_a_complete_run_measures_nothing_again(street, made, monkeypatch):
     before = next(made.rglob(layout.REPORT)).stat().st_mtime_ns
-    monkeypatch.setattr("carlasc.groundtruth.work.MeasureFrame.run", None)  # would fail
+    monkeypatch.setattr("carlasc.groundtruth.run.FrameTask._read", None)  # would fail
     assert make(street, made).skipped == FRAMES
     assert next(made.rglob(layout.REPORT)).stat().st_mtime_ns == before
 

@@ -10,8 +10,6 @@ from helpers.references.whole_drives import find_actors, link_segments
 from helpers.scenes.moving_scenes import CAR, PERSON, WALL, WALLS, box, car, film, person
 
 from carlasc.captures.settings import Lidar
-from carlasc.motion.evidence import find_evidence
-from carlasc.motion.found_actors import follow_actors
 
 
 def actors(scene, frames=40, **options):
@@ -133,9 +131,9 @@ def test_points_on_the_recording_vehicle_are_found_and_are_no_actor():
         replace(scan, points=np.concatenate([scan.points, rack]))
         for scan, _ in film(lambda _: WALLS, 24, ego_m_s=6.0, lidar=COARSE)
     ]
-    own = []
-    assert list(follow_actors(find_evidence(filmed), {}, own=own)) == []
-    (corners,) = own
+    found = find_actors(filmed)
+    assert found.tracked == ()
+    (corners,) = found.own
     assert (
         (rack > corners[:3]).all()
         and (rack < corners[3:]).all()
@@ -144,7 +142,7 @@ def test_points_on_the_recording_vehicle_are_found_and_are_no_actor():
 
 
 def test_a_car_beside_the_sensor_that_keeps_its_speed_is_not_the_recording_vehicle():
-    own = []
     filmed = film(lambda t: [*WALLS, car(6.0 * t + 1.0, 3.0)], 24, ego_m_s=6.0)
-    (actor,) = follow_actors(find_evidence(scan for scan, _ in filmed), {}, own=own)
-    assert actor.confidence > 0.8 and own == []
+    found = find_actors(scan for scan, _ in filmed)
+    (actor,) = found.tracked
+    assert actor.confidence > 0.8 and found.own == ()

@@ -7,7 +7,7 @@ import pytest
 
 from carlasc.core.cells import as_pose
 from carlasc.core.geometry import translation
-from carlasc.motion.visibility import SortedReturns, look_up, undecided
+from carlasc.motion.evidence import SortedReturns, look_up, undecided
 
 
 def wall(x, origin=(0.0, 0.0, 0.0), half=0.6, width=200):

@@ -4,7 +4,6 @@ by the numbers of the data.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from weakref import WeakKeyDictionary
 
@@ -25,7 +24,6 @@ from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import STATIC, BodyRegions, Instant
 from carlasc.groundtruth.voxel_actors import VoxelActors, centers_of, number_actors
 from carlasc.motion.tracks import FIRST_FOUND, MovingActors, Track
-from carlasc.storage.protocol import Sequence
 
 _CLASS_PARTS = 1 << 10  # in the upper 16 bits, smaller values may be a class
 _TURN_FRAMES = 3  # frames before and after, between which the turn rate of an actor is measured
@@ -39,28 +37,19 @@ def with_numbers(actors: MovingActors, feed: ScanFeed) -> MovingActors:
     highest = max((int(actor["instance"]) for actor in actors.summary), default=0)
     numbered = [track for track in actors.tracks.values() if 0 < track.instance < FIRST_FOUND]
     if len(numbered) < len(actors.tracks):
-        upper = lower = 0
-        for given in _numbers_of(feed.sequence):
-            highest, upper = (
-                max(highest, int(given.max(initial=0))),
-                max(upper, int(given.max(initial=0)) >> 16),
-            )
-            lower = max(lower, int((given & 0xFFFF).max(initial=0)))
+        upper, lower, sequence = 0, 0, feed.sequence
+        # the numbers of the points of each scan, and of the tracks of its boxes
+        for field in sorted({"boxes", "instances"} & sequence.fields()):
+            for frame in sequence.frames(field).tolist():
+                rows = sequence.read(field, frame)
+                given = (rows["track"] if field == "boxes" else rows).astype(np.int64)
+                most = int(given.max(initial=0))
+                highest, upper = max(highest, most), max(upper, most >> 16)
+                lower = max(lower, int((given & 0xFFFF).max(initial=0)))
         # new numbers are unique in the lower half too: SemanticKITTI's files keep it alone
         if upper < _CLASS_PARTS:
             highest = max(highest, upper << 16 | lower)
     return replace(actors, numbers=number_actors(actors.tracks, highest))
-
-
-def _numbers_of(sequence: Sequence) -> Iterator[IntArray]:
-    """Yield the numbers of actors in the data: of the points of each scan, and of the tracks of its
-    boxes.
-    """
-    fields = sequence.fields()
-    for frame in sequence.frames("instances").tolist() if "instances" in fields else ():
-        yield sequence.read("instances", frame).astype(np.int64)
-    for frame in sequence.frames("boxes").tolist() if "boxes" in fields else ():
-        yield sequence.read("boxes", frame)["track"].astype(np.int64)
 
 
 def find_voxels(

@@ -16,7 +16,7 @@ from uuid import uuid4
 
 import numpy as np
 
-from carlasc.core.arrays import AnyArray, BoolArray, Float32Array, IntArray, LabelArray, Uint32Array
+from carlasc.core.arrays import AnyArray, BoolArray, Float32Array, IntArray, LabelArray
 from carlasc.core.geometry import Transform, thin
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan, check_finite, lengths, sorted_by_origin
@@ -439,7 +439,10 @@ class ScanFeed:
         if scan.labels is None:
             scan = replace(scan, labels=np.full(len(scan), self.classes.geometry_id, np.uint32))
         if self.must_find_ground:
-            scan = replace(scan, labels=self._with_ground(scan.points, _labels(scan)))
+            # points without a class on the ground vote as ground
+            found = ground_points(scan.points) & (_labels(scan) == self.classes.geometry_id)
+            ground = np.where(found, min(self.classes.ground), _labels(scan)).astype(np.uint32)
+            scan = replace(scan, labels=ground)
         # Checked before points are left out: a wrong id is an error wherever it is.
         labels = _labels(scan)
         self.classes.check(labels, f"{self.sequence.location}: labels of frame {frame}")
@@ -459,16 +462,6 @@ class ScanFeed:
         with np.errstate(invalid="ignore", over="ignore"):
             distance = lengths(scan.points if origins is None else scan.points - origins)
             return (distance >= self.min_range_m) & (distance <= self.max_range_m)
-
-    def _with_ground(self, points: Float32Array, labels: LabelArray) -> Uint32Array:
-        """Return labels in which points without a class on the ground have a ground class, so that
-        they vote as ground.
-        """
-        voting = np.asarray(labels, np.uint32).copy()
-        voting[ground_points(points) & (labels == self.classes.geometry_id)] = min(
-            self.classes.ground
-        )
-        return voting
 
 
 _FEEDS: dict[str, ScanFeed] = {}  # the feed of this process, by the key of its copies: see ScanFeed

@@ -25,7 +25,7 @@ from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.groundtruth.from_scans.actor_voxels import find_voxels
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import STATIC, BodyRegions, Instant, Merger
-from carlasc.groundtruth.inputs import GridPlan
+from carlasc.groundtruth.inputs import FrameData, GridPlan
 from carlasc.groundtruth.voting.ballot import Ballot, Observation, Votes
 from carlasc.groundtruth.voting.certainty import (
     UNKNOWN,
@@ -54,27 +54,12 @@ _DOUBTFUL, _UNSURE = 0.05, 0.75  # fact: doubtful
 _NO_VOXELS = np.empty(0, np.int64)
 
 
-@dataclass(frozen=True)
-class MergedFrame:
-    """The grid of a frame, merged from the scans of a window.
-
-    Attributes:
-        grid: the grid.
-        votes: the votes that decided it, without those that complete actors.
-        evidence: the certainty of each voxel; None unless the plan needs it.
-        actors: the actor of each voxel; None unless the plan needs it.
-    """
-
-    grid: Grid
-    votes: Votes
-    evidence: VoxelCertainty | None = None
-    actors: VoxelActors | None = None
-
-
 def merge_frame(
     plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int, window: list[int]
-) -> MergedFrame:
+) -> FrameData:
     """Make the grid of a frame from the scans of a window.
+
+    The result has no fields of the scan, and its votes are without those that complete actors.
 
     Args:
         plan: geometry of the grid, and how votes are counted.
@@ -96,24 +81,30 @@ def merge_frame(
     regions = BodyRegions.at(merger, now, window, plan.spec)
     steps, bodies = _FrameSteps(plan, feed, merger, now, window, regions), regions.actors
     recent = merger.recent(now, window)  # first, to know which voxels they saw
-    ballot = steps.vote(merger.observations(now, recent), count_views=plan.needs_evidence)
+    ballot = steps.ballot(count_views=plan.needs_evidence)
+    for observation in merger.observations(now, recent):
+        ballot.add(observation)
     seen_now = ballot.seen()
     others = merger.observations(now, (other for other in window if other not in recent))
-    steps.vote(chain(others, merger.in_bodies(now, window, bodies)), ballot)
+    for observation in chain(others, merger.in_bodies(now, window, bodies)):
+        ballot.add(observation)
     votes, views = ballot.votes(copy=False), ballot.views if plan.needs_evidence else None
     # The votes are whole now: what follows decides, completes and corrects, in this order.
     del ballot  # frees memory for the next ballots
     if plan.rule != "ray":
         whole = votes.to_grid()
-        return MergedFrame(whole, votes, actors=steps.actors(whole.labels.reshape(-1)))
+        return FrameData(
+            {}, whole, votes, None, steps.actors(whole.labels.reshape(-1)), votes.boxes
+        )
     consensus = None if options.dynamic == "tube" else agree(votes.occupied, plan.spec, classes)
     made = steps.decide_seen(votes, consensus)
 
     # In these voxels, free space of rays beside a body or of other times does not count.
     contested = steps.contested()
-    doubtful = np.concatenate(
-        [regions.hidden, steps.unseen_now(contested[~seen_now[contested]], recent)]
-    )
+    unseen = contested[~seen_now[contested]]
+    if len(unseen):  # recent scans may have moving points there
+        unseen = unseen[~steps.vote(merger.moving(now, recent)).hit[unseen]]
+    doubtful = np.concatenate([regions.hidden, unseen])
     made.forget(doubtful[made.labels[doubtful] == 0])
 
     # Actors are completed by their mirror images, then by the surfaces of their tracks.
@@ -141,14 +132,14 @@ def merge_frame(
     size = plan.spec.size
     grid = Grid(plan.spec, made.labels.reshape(size), made.counts.reshape(size))
     if made.occupied is None or views is None:
-        return MergedFrame(grid, votes, actors=who)
+        return FrameData({}, grid, votes, None, who, votes.boxes)
     inferred = np.concatenate([_NO_VOXELS, *(voxels for voxels, _ in completed)])
     flags, shares = (
         steps.flags(inferred, contested),
         _join_shares(votes, consensus, completed, classes),
     )
     evidence = VoxelCertainty(made.occupied.reshape(size), shares, flags.reshape(size), views)
-    return MergedFrame(grid, votes, evidence, who)
+    return FrameData({}, grid, votes, evidence, who, votes.boxes)
 
 
 def _join_shares(
@@ -331,16 +322,9 @@ class _FrameSteps:
             flags[where] |= np.uint8(flag)
         return flags
 
-    def vote(
-        self,
-        observations: Iterable[Observation],
-        ballot: Ballot | None = None,
-        count_views: bool = False,
-    ) -> Ballot:
-        """Add the votes of observations, each in its region, to a ballot or to a new one, and
-        return it.
-        """
-        ballot = ballot or Ballot(
+    def ballot(self, count_views: bool = False) -> Ballot:
+        """Return a ballot without votes."""
+        return Ballot(
             self.plan.spec,
             self.feed.classes,
             rule=self.plan.rule,
@@ -349,6 +333,10 @@ class _FrameSteps:
             count_views=count_views,
             keep_boxes=self.plan.voting.keep_seen,
         )
+
+    def vote(self, observations: Iterable[Observation]) -> Ballot:
+        """Return the votes of observations, each in its region."""
+        ballot = self.ballot()
         for observation in observations:
             ballot.add(observation)
         return ballot
@@ -386,14 +374,6 @@ class _FrameSteps:
             return _NO_VOXELS
         others = [other for other in self.window if other != self.now.frame]
         return np.flatnonzero(self.vote(self.merger.moving(self.now, others)).hit & ~self.in_body)
-
-    def unseen_now(self, voxels: IntArray, recent: list[int]) -> IntArray:
-        """Return the voxels of `voxels` in which recent scans have no moving points."""
-        return (
-            voxels[~self.vote(self.merger.moving(self.now, recent)).hit[voxels]]
-            if len(voxels)
-            else voxels
-        )
 
     def keep_returns(self, made: _UnfinishedGrid, votes: Votes, consensus: ClassConsensus) -> None:
         """Make voxels with returns of the frame's own scan occupied, unless the returns are

@@ -315,7 +315,9 @@ class Merger:
                 continue
             # Rays are carried in the frame of the actor, where they do not depend on the frame that
             # is made: they are computed once for all frames of the window.
-            seen = [carried for other in window for carried in self._carry(number, other, now)]
+            seen = list[Observation]()
+            for other in window:
+                seen += self._carry(number, other, now)
             if not seen:
                 continue
             points = np.concatenate([carried.points for carried in seen])

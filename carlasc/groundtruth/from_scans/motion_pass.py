@@ -8,21 +8,22 @@ except for the result.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain, islice
+from itertools import chain
 from typing import Any, TypeVar
 
 import numpy as np
 
-from carlasc.core.arrays import AnyIntArray, FloatArray, IntArray
+from carlasc.core.arrays import AnyIntArray, IntArray
 from carlasc.core.geometry import invert, multiply, thin, transform_points
 from carlasc.errors import CarlascError
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.motion import (
     HORIZON_S,
+    ActorFollower,
     Chain,
     FreeSpaceEvidence,
     Linker,
@@ -30,13 +31,13 @@ from carlasc.motion import (
     Track,
     complete_bodies,
     find_evidence,
-    follow_actors,
     make_track,
     seen_from,
     tracks_from_boxes,
 )
 from carlasc.motion.bodies import surface_of
 from carlasc.motion.boxes import register_boxes
+from carlasc.motion.found_actors import FoundActor
 from carlasc.motion.refinement import RefinedPoses, ThinnedScan, refine_poses
 from carlasc.motion.tracks import FIRST_FOUND, MovingActors, with_surfaces
 from carlasc.running.processes import run_all
@@ -60,6 +61,8 @@ _ACTORS = 32  # number of actors whose tracks are estimated together
 _SHAPE_POINTS = 128  # number of points of a boxed object in a scan, for its shape and its motion
 _BLOCK = 100, 400  # least and greatest number of frames whose evidence is found in one piece
 
+_Observed = tuple[Chain, bool | None, float]
+"""The segments of an actor, whether it is rigid (None: its class decides), and its confidence."""
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -73,17 +76,18 @@ def _find_evidence(
     """
     times = feed.times
     begin, end = times[block[0]] - HORIZON_S, times[block[-1]] + HORIZON_S
-    near = (frame for frame, seconds in times.items() if begin <= seconds <= end)
-    scans = (feed.evidence_scan(frame, boxes) for frame in near)
+    near = [frame for frame, seconds in times.items() if begin <= seconds <= end]
+    scans = map(partial(feed.evidence_scan, boxes=boxes), near)
     # labels that are often wrong must not split actors
     movable = feed.classes.movable if feed.trusts_ground_labels else ()
-    chosen = set(block)
-    return [one.thinned() for one in find_evidence(scans, movable=movable) if one.frame in chosen]
+    chosen, found = set(block), list[FreeSpaceEvidence]()
+    for one in find_evidence(scans, movable=movable):
+        if one.frame in chosen:
+            found.append(one.thinned())
+    return found
 
 
-def _make_track(
-    actor: tuple[Chain, bool | None, float], times: dict[int, float], deformable: frozenset[int]
-) -> Track:
+def _make_track(actor: _Observed, times: dict[int, float], deformable: frozenset[int]) -> Track:
     """Estimate the track of one actor, in a worker."""
     chain, rigid, confidence = actor
     return make_track(chain, times, deformable=deformable, rigid=rigid, confidence=confidence)
@@ -95,114 +99,22 @@ def _follow_box(boxed: tuple[Track, list[Segment]], times: dict[int, float]) -> 
     return _with_members(register_boxes(track, segments, times), segments)
 
 
-@dataclass(frozen=True)
-class _MotionPass:
-    """The steps of `find_actors`.
+def _observed(actor: FoundActor) -> _Observed:
+    # its path is estimated again: integrated velocities would drift
+    return [replace(s, velocity=None) for s in actor.segments], actor.rigid, actor.confidence
 
-    Attributes:
-        feed: the scans of the sequence.
-        run: how the work is spread.
-        steps: called with the number of scans that were read since the last call.
-    """
 
-    feed: ScanFeed
-    run: Run
-    steps: Callable[[int], None]
-
-    def _each(
-        self, function: Callable[[Item], Result], items: Sequence[Item]
-    ) -> closing[Generator[Result]]:
-        """Return the results of a function of each item, in a context that stops the work at its
-        end.
-        """
-        return closing(run_all(function, items, self.run))
-
-    def linked(self) -> list[Track]:
-        """Return the tracks of the actors that flow or instances show."""
-        frames, times = list(self.feed.times), self.feed.times
-        linker, tracks = Linker(), list[Track]()
-        if not {"flow", "instances"} & set(self.feed.motion):
-            if "boxes" in self.feed.motion:  # a sequence of boxes without any box
-                self.steps(len(frames))
-            return tracks
-        # Linking is in order of time and in this process; segments before it and tracks after it
-        # are made in workers. Batches bound the chains that wait for their track.
-        for begin in range(0, len(frames), _BATCH):
-            ended: list[Chain] = []
-            with self._each(
-                partial(self.feed.segments, boxes=()), frames[begin : begin + _BATCH]
-            ) as scans:
-                for scan in scans:
-                    ended += linker.add(scan.frame, times[scan.frame], scan.segments, scan.static)
-                    self.steps(1)
-            if begin + _BATCH >= len(frames):
-                ended += linker.finish()
-            tracks += self._estimate([(linked, None, 1.0) for linked in ended])
-        return tracks
-
-    def boxed(self, boxes: list[Track], moving: tuple[Track, ...]) -> list[Track]:
-        """Return the tracks of annotated boxes, with the points in them."""
-        segments: dict[int, list[Segment]] = {}
-        with self._each(partial(self.feed.segments, boxes=moving), list(self.feed.times)) as scans:
-            for scan in scans:
-                for segment in scan.segments:
-                    few = replace(segment, points=thin(segment.points, _SHAPE_POINTS))
-                    segments.setdefault(segment.instance, []).append(few)
-                self.steps(1)
-        boxed = [(track, segments.get(track.instance, [])) for track in boxes]
-        with self._each(partial(_follow_box, times=self.feed.times), boxed) as tracks:
-            return with_surfaces(list(tracks))
-
-    def found(
-        self, boxes: tuple[Track, ...]
-    ) -> tuple[list[Track], dict[int, AnyIntArray], list[FloatArray]]:
-        """Return the tracks of found actors, and `moving` and `own` of `MovingActors`."""
-        frames = list(self.feed.times)
-        # A block reads the seconds around it too: longer blocks repeat less, and shorter ones keep
-        # all processes busy.
-        size = min(max(-(-len(frames) // self.run.processes), _BLOCK[0]), _BLOCK[1])
-        blocks = [tuple(frames[begin : begin + size]) for begin in range(0, len(frames), size)]
-
-        find = partial(_find_evidence, feed=self.feed, boxes=boxes)
-
-        def evidence() -> Iterator[FreeSpaceEvidence]:
-            with self._each(find, blocks) as results:
-                for found in chain.from_iterable(results):
-                    yield found
-                    self.steps(1)
-
-        classes = self.feed.classes
-        label = 0 if self.feed.has_labels else classes.geometry_id
-        moved: dict[int, IntArray] = {}
-        own: list[FloatArray] = []
-        actors = follow_actors(
-            evidence(),
-            moved,
-            deformable=classes.deformable,
-            first_instance=FIRST_FOUND,
-            default_label=label,
-            own=own,
-        )
-        tracks: list[Track] = []
-        while batch := list(islice(actors, _ACTORS)):
-            # their paths are estimated again: integrated velocities would drift
-            chains = [
-                ([replace(s, velocity=None) for s in m.segments], m.rigid, m.confidence)
-                for m in batch
-            ]
-            tracks += self._estimate(chains)
-        return tracks, _untracked(moved, tracks), own
-
-    def _estimate(self, actors: Sequence[tuple[Chain, bool | None, float]]) -> list[Track]:
-        make = partial(_make_track, times=self.feed.times, deformable=self.feed.classes.deformable)
-        with self._each(make, actors) as tracks:
-            return list(tracks)
+def _each(
+    function: Callable[[Item], Result], items: Iterable[Item], run: Run
+) -> closing[Generator[Result]]:
+    """Return the results of a function of items, in a context that stops the work at its end."""
+    return closing(run_all(function, items, run))
 
 
 def find_actors(
     feed: ScanFeed,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
-    steps: Callable[[int], None] | None = None,
+    steps: Callable[[int], None] = lambda scans: None,
 ) -> MovingActors:
     """Find the actors of a sequence.
 
@@ -215,16 +127,82 @@ def find_actors(
         FormatError: a scan is not valid.
     """
     # Boxes and fields first: evidence from free space explains only what they leave unexplained.
-    by = _MotionPass(feed, run, steps or (lambda scans: None))
     boxes = _box_tracks(feed)
     moving_boxes = tuple(track for track in boxes if track.moves)
-    tracks = by.boxed(boxes, moving_boxes) if boxes else by.linked()
-    moving: dict[int, AnyIntArray] = {}
-    own: list[FloatArray] = []
-    if "evidence" in feed.motion:
-        found, moving, own = by.found(moving_boxes)
-        tracks += found
-    return MovingActors.of(tracks if boxes else complete_bodies(tracks), moving, own)
+    tracks = _boxed(feed, run, steps, boxes, moving_boxes) if boxes else _linked(feed, run, steps)
+    if "evidence" not in feed.motion:
+        return MovingActors.of(tracks if boxes else complete_bodies(tracks))
+    frames, classes = list(feed.times), feed.classes
+    # A block reads the seconds around it too: longer blocks repeat less, and shorter ones keep all
+    # processes busy.
+    size = min(max(-(-len(frames) // run.processes), _BLOCK[0]), _BLOCK[1])
+    blocks = [tuple(frames[begin : begin + size]) for begin in range(0, len(frames), size)]
+    follower = ActorFollower(
+        deformable=classes.deformable,
+        first_instance=FIRST_FOUND,
+        default_label=0 if feed.has_labels else classes.geometry_id,
+    )
+    found, waiting = list[Track](), list[_Observed]()
+    with _each(partial(_find_evidence, feed=feed, boxes=moving_boxes), blocks, run) as results:
+        for evidence in chain.from_iterable(results):
+            waiting += map(_observed, follower.add(evidence))
+            steps(1)
+            if len(waiting) >= _ACTORS:
+                found += _estimate(feed, run, waiting)
+                waiting = []
+    found += _estimate(feed, run, [*waiting, *map(_observed, follower.finish())])
+    tracks += found
+    moving = _untracked(follower.moved, found)
+    return MovingActors.of(tracks if boxes else complete_bodies(tracks), moving, follower.own)
+
+
+def _linked(feed: ScanFeed, run: Run, steps: Callable[[int], None]) -> list[Track]:
+    """Return the tracks of the actors that flow or instances show."""
+    frames, times, tracks = list(feed.times), feed.times, list[Track]()
+    if not {"flow", "instances"} & set(feed.motion):
+        if "boxes" in feed.motion:  # a sequence of boxes without any box
+            steps(len(frames))
+        return tracks
+    linker = Linker()
+    # Linking is in order of time and in this process; segments before it and tracks after it are
+    # made in workers. Batches bound the chains that wait for their track.
+    for begin in range(0, len(frames), _BATCH):
+        ended: list[Chain] = []
+        with _each(partial(feed.segments, boxes=()), frames[begin : begin + _BATCH], run) as scans:
+            for scan in scans:
+                ended += linker.add(scan.frame, times[scan.frame], scan.segments, scan.static)
+                steps(1)
+        if begin + _BATCH >= len(frames):
+            ended += linker.finish()
+        tracks += _estimate(feed, run, [(linked, None, 1.0) for linked in ended])
+    return tracks
+
+
+def _boxed(
+    feed: ScanFeed,
+    run: Run,
+    steps: Callable[[int], None],
+    boxes: list[Track],
+    moving: tuple[Track, ...],
+) -> list[Track]:
+    """Return the tracks of annotated boxes, with the points in them."""
+    segments: dict[int, list[Segment]] = {}
+    with _each(partial(feed.segments, boxes=moving), list(feed.times), run) as scans:
+        for scan in scans:
+            for segment in scan.segments:
+                few = replace(segment, points=thin(segment.points, _SHAPE_POINTS))
+                segments.setdefault(segment.instance, []).append(few)
+            steps(1)
+    boxed = [(track, segments.get(track.instance, [])) for track in boxes]
+    with _each(partial(_follow_box, times=feed.times), boxed, run) as tracks:
+        return with_surfaces(list(tracks))
+
+
+def _estimate(feed: ScanFeed, run: Run, actors: Iterable[_Observed]) -> list[Track]:
+    """Return the tracks of actors."""
+    make = partial(_make_track, times=feed.times, deformable=feed.classes.deformable)
+    with _each(make, actors, run) as tracks:
+        return list(tracks)
 
 
 def _untracked(moved: dict[int, IntArray], tracks: list[Track]) -> dict[int, AnyIntArray]:
@@ -282,30 +260,47 @@ def _box_tracks(feed: ScanFeed) -> list[Track]:
     return tracks_from_boxes(boxes, poses, feed.times, deformable=feed.classes.deformable)
 
 
-def read_or_find_actors(
-    feed: ScanFeed, writer: SequenceWriter | None, run: Run, steps: Callable[[int], None]
-) -> MovingActors:
-    """Return the actors that an earlier run kept for the same scans and options; without any, find
-    and keep them. Without a writer, nothing is kept.
+@dataclass(frozen=True)
+class Kept:
+    """A file of actors or of refined poses, for later runs with the same scans and settings.
+
+    Attributes:
+        writer: keeps the file beside the grids; None: nothing is kept.
+        name: `TRACKS` or `POSES`.
+        key: digest of the scans, their given poses, and the settings.
     """
-    if writer is None:
-        return find_actors(feed, run, steps)
-    about = {"motion": feed.motion, "min_speed_m_s": feed.options.motion.min_speed_m_s}
-    key = _key_of(TRACKS, feed, **about)
-    actors = read_derived(writer, TRACKS, key, MovingActors.from_bytes)
-    if actors is None:
-        actors = find_actors(feed, run, steps)
-        writer.write_document(layout.derived(TRACKS, key), actors.to_bytes(key))
-    else:
-        steps(feed.reads_for_actors)
-    return actors
+
+    writer: SequenceWriter | None
+    name: str
+    key: str
+
+    @classmethod
+    def of(cls, writer: SequenceWriter | None, name: str, feed: ScanFeed, **settings: Any) -> Kept:
+        """Return the file for the scans of a feed."""
+        if writer is None:
+            return cls(writer, name, "")
+        # The digest of scans, not of poses, is given: `derived_key` adds the given poses.
+        settings = {"range_m": [feed.min_range_m, str(feed.max_range_m)], **settings}
+        args = feed.sequence, feed.frames, feed.digest
+        return cls(writer, name, derived_key(*args, version=_VERSIONS[name], **settings))
+
+    def read(self, parse: Callable[[bytes, str], tuple[Result, str]]) -> Result | None:
+        """Return what the file holds; None without one."""
+        return (
+            None if self.writer is None else read_derived(self.writer, self.name, self.key, parse)
+        )
+
+    @property
+    def document(self) -> str:
+        """Name of the file in the folder of the sequence."""
+        return layout.derived(self.name, self.key)
 
 
 def refine_sequence(
     feed: ScanFeed,
     writer: SequenceWriter | None = None,
     run: Run = Run(),  # noqa: B008 (frozen)
-    steps: Callable[[int], None] | None = None,
+    steps: Callable[[int], None] = lambda scans: None,
 ) -> RefinedPoses:
     """Refine the poses of the frames of a sequence, or return what an earlier run kept.
 
@@ -316,22 +311,16 @@ def refine_sequence(
         steps: called with the number of scans that were read since the last call.
     """
     frames, mode = feed.frames.tolist(), feed.options.poses.refine
-    key = (
-        ""
-        if writer is None
-        else _key_of(POSES, feed, refine=mode, movable=sorted(feed.classes.movable))
-    )
-    kept = None if writer is None else read_derived(writer, POSES, key, RefinedPoses.from_bytes)
-    if kept is not None:
-        if steps is not None:
-            steps(len(frames))
-        return kept
-    # The digest of scans, not of poses, is in the key: `derived_key` adds the given poses.
+    file = Kept.of(writer, POSES, feed, refine=mode, movable=sorted(feed.classes.movable))
+    refined = file.read(RefinedPoses.from_bytes)
+    if refined is not None:
+        steps(len(frames))
+        return refined
     given = np.stack([feed.pose(frame) for frame in frames])
-    with closing(run_all(partial(_thin_scan, feed=feed), frames, run)) as scans:
+    with _each(partial(_thin_scan, feed=feed), frames, run) as scans:
         refined = refine_poses(scans, given, always=mode == "always", steps=steps)
     if writer is not None:
-        writer.write_document(layout.derived(POSES, key), refined.to_bytes(key))
+        writer.write_document(file.document, refined.to_bytes(file.key))
     return refined
 
 
@@ -342,13 +331,6 @@ def _thin_scan(frame: int, feed: ScanFeed) -> ThinnedScan:
     except CarlascError:  # making the frame raises the same error, which is reported
         points = np.empty((0, 3), np.float32)
     return ThinnedScan.of(points, feed.pose(frame))
-
-
-def _key_of(name: str, feed: ScanFeed, **settings: Any) -> str:
-    ranges = [feed.min_range_m, str(feed.max_range_m)]
-    return derived_key(
-        feed.sequence, feed.frames, feed.digest, version=_VERSIONS[name], range_m=ranges, **settings
-    )
 
 
 def with_refined_poses(

@@ -7,7 +7,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Series
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self
 
@@ -21,8 +21,10 @@ from carlasc.groundtruth.from_scans.actor_voxels import with_numbers
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.motion_pass import (
+    TRACKS,
+    Kept,
+    find_actors,
     pose_notes,
-    read_or_find_actors,
     refine_sequence,
     with_refined_poses,
 )
@@ -99,12 +101,9 @@ class ScanFrame(FrameInput):
         """Read the files of the frame, and count the votes of the scans in its window."""
         feed = self.inputs.feed
         fields = {name: feed.sequence.read(name, self.number) for name in self.fields()}
-        merged = merge_frame(
-            plan, feed, self.inputs.actors, self.number, feed.reaching(self.number, plan.spec)
-        )
-        return FrameData(
-            fields, merged.grid, merged.votes, merged.evidence, merged.actors, merged.votes.boxes
-        )
+        window = feed.reaching(self.number, plan.spec)
+        merged = merge_frame(plan, feed, self.inputs.actors, self.number, window)
+        return replace(merged, fields=fields)
 
     def thinned(self, plan: GridPlan) -> Grid:
         """Return the grid without every tenth of the scans of other frames."""
@@ -207,7 +206,16 @@ class ScanSequence(StoredSequence):
         """
         self.refine(writer, run, steps)
         if self.feed.needs_actors:
-            self.actors = read_or_find_actors(self.feed, writer, run, steps)
+            feed, speed = self.feed, self.options.motion.min_speed_m_s
+            file = Kept.of(writer, TRACKS, feed, motion=feed.motion, min_speed_m_s=speed)
+            kept = file.read(MovingActors.from_bytes)
+            if kept is None:
+                self.actors = find_actors(feed, run, steps)
+                if writer is not None:
+                    writer.write_document(file.document, self.actors.to_bytes(file.key))
+            else:
+                self.actors = kept
+                steps(feed.reads_for_actors)
         if self.plan.voting.keep_actors:
             self.actors = with_numbers(self.actors, self.feed)
 

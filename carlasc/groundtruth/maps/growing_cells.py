@@ -50,7 +50,7 @@ def rows_of_scan(
     points: FloatArray,
     labels: LabelArray,
     sure: Float32Array | None,
-    groups: IntArray,
+    group: int,
     cell_m: float,
 ) -> tuple[IntArray, AnyArray]:
     """Return the cells in which a scan has points.
@@ -59,7 +59,7 @@ def rows_of_scan(
         points: (N, 3) metres, map frame, or the frame of their actor.
         labels: (N,) classes.
         sure: (N,) probability of each class; None: 1.
-        groups: (N,) `STATIC`, or the number of an actor.
+        group: `STATIC`, or the number of an actor.
         cell_m: size of a cell, metres.
 
     Returns:
@@ -70,12 +70,8 @@ def rows_of_scan(
     scaled = points / cell_m
     cells = np.floor(scaled).astype(np.int64)
     places = np.minimum(np.floor((scaled - cells) * _STEPS), _STEPS - 1).astype(np.int64)
-    whole = (groups, cells[:, 0], cells[:, 1], cells[:, 2])
-    order = np.lexsort((labels, *whole[::-1]))
-    changed = np.zeros(len(order), np.bool_)
-    changed[0] = True
-    for column in whole:
-        changed[1:] |= np.diff(column[order]) != 0
+    order = np.lexsort((labels, *cells.T[::-1]))
+    changed = np.append(True, np.diff(cells[order], axis=0).any(axis=1))
     begins = np.flatnonzero(changed)
     rows = np.zeros(len(begins), ROW_DTYPE)
     rows["seen"], rows["points"] = 1, np.diff(np.append(begins, len(order)))
@@ -103,7 +99,7 @@ def rows_of_scan(
     rows["key"] = (((x << _SIDE_BITS | y) << _HEIGHT_BITS | z) << _LABEL_BITS) | sorted_labels[
         runs[best]
     ]
-    return np.column_stack([groups[order[begins]], tile]), rows
+    return np.column_stack([np.full(len(tile), group), tile]), rows
 
 
 def split(parts: IntArray, rows: AnyArray) -> list[tuple[Part, AnyArray]]:

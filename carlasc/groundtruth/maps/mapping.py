@@ -328,9 +328,7 @@ class _AddScans:
         for group, points, places in chosen:
             right = places * (1, -1, 1) if feed.sequence.metadata.axes == "left" else places
             sure = None if scan.sure is None else scan.sure[points]
-            yield rows_of_scan(
-                right, labels[points], sure, np.full(len(points), group), self.cell_m
-            )
+            yield rows_of_scan(right, labels[points], sure, group, self.cell_m)
 
 
 def write_grid(source: Source, name: str, frames: FrameRange, files: MapFiles) -> int:

@@ -135,24 +135,28 @@ def probability(
         step_m: distance between two free samples of a ray, metres.
     """
     posterior = np.empty(len(hits), np.float32)
+    # the volume of a cell, m^3; in a cylindrical grid at half the greatest radius
+    x, y, z = spec.voxel_size.tolist()
+    volume = x * z * (y * spec.upper[0] / 2 if spec.coordinates == "cylindrical" else y)
+    # 0 for voxels of 0.4 m, 1 for voxels of 0.2 m: the two sizes of the calibration.
+    finer = math.log2(0.4 / min(max(float(np.cbrt(volume)), _SMALLEST_M), _LARGEST_M))
+    curves = _HIT[:, 0] + finer * (_HIT[:, 1] - _HIT[:, 0])
     for begin in range(0, len(hits), _BLOCK):
         part = slice(begin, begin + _BLOCK)
-        posterior[part] = _probability(
-            hits[part], free_m[part], matter[part], in_body[part], spec, step_m
+        posterior[part] = _logistic(
+            hits[part], free_m[part], matter[part], in_body[part], curves, step_m
         )
     return posterior
 
 
-def _probability(
+def _logistic(
     hits: AnyIntArray,
     free_m: AnyFloatArray,
     matter: NDArray[np.int8],
     in_body: BoolArray,
-    spec: GridSpec,
+    curves: FloatArray,
     step_m: float,
 ) -> AnyFloatArray:
-    # 0 for voxels of 0.4 m, 1 for voxels of 0.2 m: the two sizes of the calibration.
-    finer = math.log2(0.4 / min(max(float(np.cbrt(_volume(spec))), _SMALLEST_M), _LARGEST_M))
     samples = np.log(np.maximum(free_m / step_m, 1.0))
     score = np.where(
         in_body, _FREE_IN_BODY[0] + _FREE_IN_BODY[1] * samples, _FREE[0] + _FREE[1] * samples
@@ -160,18 +164,12 @@ def _probability(
     # One half is added to hits and to the hits at the threshold: few hits are weak evidence, and
     # the ratio is finite without a free path.
     hit = hits > 0
-    offset, slope = (_HIT[:, 0] + finer * (_HIT[:, 1] - _HIT[:, 0]))[matter[hit]].T
+    offset, slope = curves[matter[hit]].T
     ratio = np.log((hits[hit] + 0.5) / (_PER_M[matter[hit]] * free_m[hit] + 0.5))
     # More hits must never lower a probability, also where the slope is extrapolated to other sizes.
     score[hit] = offset + np.maximum(slope, 0.2) * ratio
     posterior = 1 / (1 + np.exp(-score))
     return np.where(hit | (free_m > 0), posterior, UNKNOWN)
-
-
-def _volume(spec: GridSpec) -> float:
-    """Return the volume of a cell, m^3; in a cylindrical grid at half the greatest radius."""
-    x, y, z = spec.voxel_size.tolist()
-    return float(x * z * (y * spec.upper[0] / 2 if spec.coordinates == "cylindrical" else y))
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.motion import (
+    ActorFollower,
     EvidenceScan,
     Linker,
     Segment,
@@ -16,7 +18,6 @@ from carlasc.motion import (
     Track,
     complete_bodies,
     find_evidence,
-    follow_actors,
     make_track,
 )
 from carlasc.motion.found_actors import FoundActor
@@ -64,10 +65,12 @@ class FoundActors:
             tracked or not. They must be left out of other frames.
         tracked: the actors whose observations align better along an estimated path than without
             motion.
+        own: (6,) lower and upper corners of the parts of the recording vehicle.
     """
 
     moved: Mapping[int, NDArray[np.int64]]
     tracked: tuple[FoundActor, ...]
+    own: tuple[NDArray[np.float64], ...]
 
     @property
     def segments(self) -> list[Segment]:
@@ -100,13 +103,9 @@ def find_actors(
     Returns:
         The points that moved, and the actors with enough evidence.
     """
-    moved: dict[int, NDArray[np.int64]] = {}
-    evidence = find_evidence(scans, movable=movable)
-    tracked = follow_actors(
-        evidence,
-        moved,
-        deformable=deformable,
-        first_instance=first_instance,
-        default_label=default_label,
+    follower = ActorFollower(
+        deformable=deformable, first_instance=first_instance, default_label=default_label
     )
-    return FoundActors(moved, tuple(tracked))
+    ended = [follower.add(evidence) for evidence in find_evidence(scans, movable=movable)]
+    tracked = chain.from_iterable([*ended, follower.finish()])
+    return FoundActors(follower.moved, tuple(tracked), tuple(follower.own))
