@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -14,6 +13,7 @@ from carlasc.core.choices import Preset, TrafficLevel
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ConflictError, DependencyError, import_extra
 from carlasc.running.spreading import Run
+from carlasc.storage.files import AnyPath
 
 if TYPE_CHECKING:
     from carlasc.inspection.findings import ValidationResult
@@ -57,7 +57,7 @@ class DemoResult:
 
 
 def demonstrate(
-    out: str | os.PathLike[str],
+    out: AnyPath,
     *,
     count: int = 6,
     sensors: int = 20,

@@ -10,7 +10,6 @@ cameras.json  images/{camera}/{f}.jpg, and the other folders of images
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
@@ -29,6 +28,7 @@ from carlasc.errors import CarlascError, FormatError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.arrays import ArrayFormat, parse_npy
 from carlasc.storage.camera_files import cameras_from_json
+from carlasc.storage.files import AnyPath
 from carlasc.storage.transport.remote_tree import RemoteTree, tree_of
 from carlasc.storage.transport.trees import LocalTree, Tree
 
@@ -141,7 +141,7 @@ class Capture:
         classes: class table of the labels.
     """
 
-    def __init__(self, source: str | os.PathLike[str] | Tree, classes: ClassTable = CARLA) -> None:
+    def __init__(self, source: AnyPath | Tree, classes: ClassTable = CARLA) -> None:
         """Keep the folder of a capture. Sensors and frames are listed on first use.
 
         Args:
@@ -369,7 +369,7 @@ class Capture:
         return f"<Capture {self.location}>"
 
 
-def find_captures(source: str | os.PathLike[str]) -> dict[str, Capture]:
+def find_captures(source: AnyPath) -> dict[str, Capture]:
     """Find the captures in a folder.
 
     Args:

@@ -28,6 +28,7 @@ from carlasc.errors import ArgumentError, MissingDataError, check_choice
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage.camera_files import cameras_to_json
+from carlasc.storage.files import AnyPath
 from carlasc.storage.layout import CAMERAS, FRAME_PERIOD_S
 from carlasc.storage.transport.targets import check_shared
 
@@ -184,7 +185,7 @@ class SimulationResult:
 
 
 def simulate(
-    out: str | os.PathLike[str],
+    out: AnyPath,
     *,
     simulator: str = TOWN,
     count: int = 20,

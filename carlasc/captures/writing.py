@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any, Self
@@ -24,7 +23,7 @@ from carlasc.captures.raw import (
 from carlasc.core.arrays import AnyArray, Uint8Array
 from carlasc.core.geometry import check_rigid
 from carlasc.errors import ConflictError, FormatError
-from carlasc.storage.files import has_content, parse_json, remove_stale, to_json
+from carlasc.storage.files import AnyPath, has_content, parse_json, remove_stale, to_json
 from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc.storage.transport.targets import LocalTarget, Target, target_of
 
@@ -40,7 +39,7 @@ class CaptureWriter:
         location: name of the folder raw/ in errors.
     """
 
-    def __init__(self, out: str | os.PathLike[str] | Target, **storage_options: Any) -> None:
+    def __init__(self, out: AnyPath | Target, **storage_options: Any) -> None:
         """Keep the folder of a sequence. Files are written to `<out>/raw`.
 
         Args:

@@ -88,6 +88,7 @@ _KINDS = {
     **dict.fromkeys(("Collection[str]", "Sequence[str]"), ValueKind(list[str])),
     **{name: ValueKind(value) for name, value in vars(choices).items() if get_args(value)},
     **{kind.__name__: ValueKind(kind) for kind in (bool, float, int, str)},
+    "AnyPath": ValueKind(str),
     "Frames": ValueKind(str, read_frames, "A:B"),
     "SceneSource": ValueKind(str, read_place),
     "Viewpoint": ValueKind(str, _read_viewpoint),

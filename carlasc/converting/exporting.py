@@ -26,6 +26,7 @@ from carlasc.errors import CarlascError, ConflictError, FormatError, MissingData
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Part, Run, StepCounter
 from carlasc.storage.files import (
+    AnyPath,
     has_content,
     make_folder,
     parse_json,
@@ -67,8 +68,8 @@ class ExportResult:
 
 def export(
     name: str,
-    source: str | os.PathLike[str] | storage.Source,
-    out: str | os.PathLike[str],
+    source: AnyPath | storage.Source,
+    out: AnyPath,
     *,
     sequences: Collection[str] | None = None,
     overwrite: bool = False,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ from carlasc.converting.registry import find_recordings, open_converter
 from carlasc.core.arrays import Float32Array
 from carlasc.motion.ground import find_ground
 from carlasc.motion.options import PoseOptions
+from carlasc.storage.files import AnyPath
 
 _LEAST_M = 0.3  # ground must be at least this far below the sensor
 _UP = {
@@ -76,7 +76,7 @@ class RecordingPreview:
 
 def preview(
     name: str | type[Converter],
-    source: str | os.PathLike[str],
+    source: AnyPath,
     *,
     sequences: Collection[str] | None = None,
     split: SplitName = "all",

@@ -4,7 +4,6 @@ from these sequences.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Collection, Mapping
 from collections.abc import Sequence as Series
@@ -28,6 +27,7 @@ from carlasc.motion.ground import Ground, joined
 from carlasc.motion.options import PoseOptions
 from carlasc.running.processes import one_pool
 from carlasc.running.spreading import Part, Run, StepCounter
+from carlasc.storage.files import AnyPath
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.opening import as_sink
 from carlasc.storage.protocol import Sequence, Source
@@ -66,8 +66,8 @@ class ConvertResult:
 
 def convert(
     name: str | type[Converter],
-    source: str | os.PathLike[str],
-    out: str | os.PathLike[str] | Sink,
+    source: AnyPath,
+    out: AnyPath | Sink,
     *,
     sequences: Collection[str] | None = None,
     split: SplitName = "all",
@@ -199,7 +199,7 @@ def _make_grids(
     conversions: Series[Conversion],
     grids: GridOptions,
     sink: Sink,
-    out: str | os.PathLike[str] | Sink,
+    out: AnyPath | Sink,
     poses: PoseOptions,
     run: Run,
 ) -> RegridResult | None:

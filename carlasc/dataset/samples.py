@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import operator
-import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
@@ -44,6 +43,7 @@ from carlasc.dataset.selection import (
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_choice, count
 from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.camera_files import image_fields
+from carlasc.storage.files import AnyPath
 from carlasc.storage.metadata import Axes
 from carlasc.storage.transport.caching import CachedTree
 
@@ -118,13 +118,13 @@ class Dataset(_MapStyle):
 
     def __init__(
         self,
-        source: str | os.PathLike[str] | Source,
+        source: AnyPath | Source,
         split: str | Iterable[str] | None = None,
         *,
         history: int = 1,
         coordinates: Coordinates = "cartesian",
         grid: str | GridSpec = layout.EVALUATION,
-        grids_source: str | os.PathLike[str] | Source | None = None,
+        grids_source: AnyPath | Source | None = None,
         fields: Iterable[str] = ("occupancy", "labels", "known"),
         remap: RemapLike = "auto",
         align: bool = True,

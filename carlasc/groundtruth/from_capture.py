@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -18,6 +17,7 @@ from carlasc.groundtruth.voting.ballot import Observation, count_votes
 from carlasc.groundtruth.voxel_actors import ActorPoints
 from carlasc.storage import layout
 from carlasc.storage.camera_files import cameras_to_json
+from carlasc.storage.files import AnyPath
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import Source
 
@@ -190,9 +190,7 @@ class CaptureSequence(SequenceInput):
         return {"observe": "capture", "frames": frames, "sensors": len(self.capture.sensors)}
 
 
-def capture_sequences(
-    source: str | os.PathLike[str] | Source | Capture, plan: GridPlan
-) -> list[SequenceInput]:
+def capture_sequences(source: AnyPath | Source | Capture, plan: GridPlan) -> list[SequenceInput]:
     """Find the captures in or below a folder.
 
     Raises:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +26,7 @@ from carlasc.groundtruth.inputs import (
 from carlasc.groundtruth.options import FromGrid
 from carlasc.groundtruth.voting.ballot import Observation, count_votes
 from carlasc.storage import as_source
+from carlasc.storage.files import AnyPath
 from carlasc.storage.protocol import Sequence, Source
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ class ResampledSequence(StoredSequence):
 
 
 def resampled_sequences(
-    source: str | os.PathLike[str] | Source, plan: GridPlan, observe: FromGrid
+    source: AnyPath | Source, plan: GridPlan, observe: FromGrid
 ) -> list[SequenceInput]:
     """Find the sequences of a source that have a finer grid of the same coordinates.
 

@@ -6,7 +6,6 @@ A `FrameTask` pickles into a worker, where a frame is made, or an existing frame
 
 from __future__ import annotations
 
-import os
 import time
 from collections import deque
 from collections.abc import Iterator, Set
@@ -42,7 +41,7 @@ from carlasc.groundtruth.seen import check_views, see_voxels
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
-from carlasc.storage.files import parse_json, to_json
+from carlasc.storage.files import AnyPath, parse_json, to_json
 from carlasc.storage.opening import as_sink
 from carlasc.storage.protocol import Source
 from carlasc.storage.resuming import (
@@ -89,9 +88,9 @@ class RegridResult:
 
 
 def regrid(
-    source: str | os.PathLike[str] | Source | Capture,
+    source: AnyPath | Source | Capture,
     spec: GridSpec,
-    out: str | os.PathLike[str] | Sink | None = None,
+    out: AnyPath | Sink | None = None,
     *,
     observe: Observe | None = None,
     voting: Voting = Voting(),  # noqa: B008 (frozen)
@@ -174,7 +173,7 @@ def regrid(
     )
 
 
-def _choose(source: str | os.PathLike[str] | Source | Capture) -> Observe:
+def _choose(source: AnyPath | Source | Capture) -> Observe:
     """Return the default of `observe`: a capture if there is one, otherwise scans.
 
     Raises:
@@ -203,9 +202,7 @@ def _choose(source: str | os.PathLike[str] | Source | Capture) -> Observe:
     return FromScans()
 
 
-def _sequences(
-    source: str | os.PathLike[str] | Source | Capture, plan: GridPlan
-) -> list[SequenceInput]:
+def _sequences(source: AnyPath | Source | Capture, plan: GridPlan) -> list[SequenceInput]:
     """Return the sequences of a source.
 
     Raises:
@@ -223,7 +220,7 @@ def _sequences(
     return resampled_sequences(source, plan, plan.observe)
 
 
-def _folder_of(source: str | os.PathLike[str] | Source | Capture) -> str | Path:
+def _folder_of(source: AnyPath | Source | Capture) -> str | Path:
     """Return the default of `out`: the source, beside raw/ and `<coordinates>/`.
 
     Raises:

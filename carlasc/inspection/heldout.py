@@ -4,7 +4,6 @@ are made from the other scans.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
@@ -29,6 +28,7 @@ from carlasc.motion.tracks import MovingActors
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
+from carlasc.storage.files import AnyPath
 from carlasc.storage.protocol import Sequence, Source
 
 EVERY = 10
@@ -96,7 +96,7 @@ class _HeldOutFrame:
 
 
 def holdout(
-    source: str | os.PathLike[str] | Source,
+    source: AnyPath | Source,
     spec: GridSpec | None = None,
     *,
     observe: FromScans = FromScans(),  # noqa: B008 (frozen)

@@ -4,7 +4,6 @@ files only.
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
@@ -19,6 +18,7 @@ from carlasc.core.arrays import IntArray
 from carlasc.core.notebook import data_frame
 from carlasc.errors import CarlascError, MissingDataError, without_credentials
 from carlasc.storage import as_source, layout
+from carlasc.storage.files import AnyPath
 from carlasc.storage.folder import FolderSequence
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import Sequence, Source
@@ -158,7 +158,7 @@ class Overview:
         return asdict(self) | {"splits": self.splits}
 
 
-def info(source: str | os.PathLike[str] | Source) -> Overview:
+def info(source: AnyPath | Source) -> Overview:
     """List the contents of a data set. No frame is read.
 
     Args:

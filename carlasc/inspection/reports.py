@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, fields, replace
@@ -21,7 +20,7 @@ from carlasc.motion.options import MotionOptions, PoseOptions
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
-from carlasc.storage.files import write_output
+from carlasc.storage.files import AnyPath, write_output
 from carlasc.storage.folder import FolderSequence
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.resuming import RECORD, read_record
@@ -55,7 +54,7 @@ class ReportResult:
 
 
 def report(
-    source: str | os.PathLike[str] | Source,
+    source: AnyPath | Source,
     *,
     grid: str | None = None,
     remake: bool = False,

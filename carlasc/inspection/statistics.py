@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,6 +17,7 @@ from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingData
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
+from carlasc.storage.files import AnyPath
 from carlasc.storage.layout import EVALUATION
 from carlasc.storage.protocol import Sequence, Source
 
@@ -184,7 +184,7 @@ class Statistics:
 
 
 def stats(
-    source: str | os.PathLike[str] | Source,
+    source: AnyPath | Source,
     *,
     grid: str = EVALUATION,
     remap: str | Remap | None = "auto",

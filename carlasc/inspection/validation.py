@@ -4,7 +4,6 @@ grid are unchanged since its report.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -35,6 +34,7 @@ from carlasc.motion.ground import ground_of
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
+from carlasc.storage.files import AnyPath
 from carlasc.storage.folder import FolderSequence
 from carlasc.storage.protocol import Sequence, Source
 
@@ -147,7 +147,7 @@ Progress = Callable[[int, int], None]
 
 
 def validate(
-    source: str | os.PathLike[str] | Source,
+    source: AnyPath | Source,
     *,
     every: int | None = None,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import html
 import math
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from carlasc.core.notebook import data_frame
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.metrics.results import Cell, FigureTable
-from carlasc.storage.files import parse_json
+from carlasc.storage.files import AnyPath, parse_json
 
 if TYPE_CHECKING:
     import pandas
@@ -124,7 +123,7 @@ class ScoreTable:
         return f'<svg {size} role="img" aria-label="IoU of each class">{bars}</svg>'
 
 
-def scores(files: Iterable[str | os.PathLike[str]], *, mixed: bool = False) -> ScoreTable:
+def scores(files: Iterable[AnyPath], *, mixed: bool = False) -> ScoreTable:
     """Read the results of several evaluations (`carlasc evaluate --json`) into one table.
 
     Args:

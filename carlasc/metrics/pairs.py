@@ -7,7 +7,6 @@ SemanticKITTI and SSCBench.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
@@ -25,9 +24,10 @@ from carlasc.errors import FormatError, MissingDataError, first_names
 from carlasc.metrics.grids import GridFrames, LabelFolder, SeenBy, SequenceGrid, find_carlaocc
 from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.arrays import NUMBERS, WHOLE_NUMBERS, ArrayFormat, open_npz, read_npy
+from carlasc.storage.files import AnyPath
 from carlasc.storage.layout import identity_of
 
-Place = str | os.PathLike[str] | Source
+Place = AnyPath | Source
 
 OCC3D_SPEC = GridSpec("cartesian", (200, 200, 16), (-40.0, -40.0, -1.0), (40.0, 40.0, 5.4))
 OPENOCCUPANCY_SPEC = GridSpec("cartesian", (512, 512, 40), (-51.2, -51.2, -5.0), (51.2, 51.2, 3.0))

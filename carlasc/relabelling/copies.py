@@ -4,7 +4,6 @@ inputs, and writing in two stages.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ from carlasc.running.processes import one_pool
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.derived_copies import CopyResult, DerivedCopy, DerivedSequence
+from carlasc.storage.files import AnyPath
 from carlasc.storage.metadata import PREDICTED
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter
@@ -90,7 +90,7 @@ def timed(copied: CopyResult, began: float) -> dict[str, Any]:
 
 def begin_predicted(
     source: Source,
-    out: str | os.PathLike[str],
+    out: AnyPath,
     settings: Mapping[str, Any],
     classes: ClassTable | None,
     overwrite: bool,

@@ -58,6 +58,7 @@ from carlasc.storage.camera_files import (
     scan_T_camera,
 )
 from carlasc.storage.derived_copies import sequences_with_scans
+from carlasc.storage.files import AnyPath
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter
 
@@ -84,11 +85,11 @@ _EDGE = 2.0  # power of the agreement of a pixel with the pixels around it, whic
 
 
 def label_images(
-    source: str | os.PathLike[str] | Source,
-    out: str | os.PathLike[str],
+    source: AnyPath | Source,
+    out: AnyPath,
     *,
-    pixels: str | os.PathLike[str] | None = None,
-    classes: str | os.PathLike[str] | ClassTable | None = None,
+    pixels: AnyPath | None = None,
+    classes: AnyPath | ClassTable | None = None,
     by: str | None = None,
     observe: FromScans = FromScans(),  # noqa: B008 (frozen)
     overwrite: bool = False,

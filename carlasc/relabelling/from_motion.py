@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -30,6 +29,7 @@ from carlasc.storage.derived_copies import (
     DerivedSequence,
     sequences_with_scans,
 )
+from carlasc.storage.files import AnyPath
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter
 
@@ -51,8 +51,8 @@ class MotionResult(CopyResult):
 
 
 def label_motion(
-    source: str | os.PathLike[str] | Source,
-    out: str | os.PathLike[str],
+    source: AnyPath | Source,
+    out: AnyPath,
     *,
     observe: FromScans = FromScans(),  # noqa: B008 (frozen)
     overwrite: bool = False,

@@ -38,7 +38,7 @@ from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.arrays import NUMBERS, WHOLE_NUMBERS, ArrayFormat, open_npz, read_npy
 from carlasc.storage.derived_copies import sequences_with_scans
-from carlasc.storage.files import parse_json
+from carlasc.storage.files import AnyPath, parse_json
 from carlasc.storage.protocol import Sequence, Source
 
 SUFFIXES = (".label", ".npy", ".npz")
@@ -50,11 +50,11 @@ _NAMED = 5  # number of frames that a message lists
 
 
 def label(
-    source: str | os.PathLike[str] | Source,
-    out: str | os.PathLike[str],
-    predictions: str | os.PathLike[str],
+    source: AnyPath | Source,
+    out: AnyPath,
+    predictions: AnyPath,
     *,
-    classes: str | os.PathLike[str] | ClassTable | None = None,
+    classes: AnyPath | ClassTable | None = None,
     logits: bool = False,
     by: str | None = None,
     frames: Frames = None,
@@ -199,7 +199,7 @@ def find_predictions(
     return result
 
 
-def read_table(classes: str | os.PathLike[str] | ClassTable) -> ClassTable:
+def read_table(classes: AnyPath | ClassTable) -> ClassTable:
     """Return a class table, given as a table, its name, or a JSON file: a class table in the form
     of carlasc.json, or a carlasc.json.
 

@@ -4,7 +4,6 @@ those of the source.
 
 from __future__ import annotations
 
-import os
 import time
 from dataclasses import dataclass, field, replace
 
@@ -38,6 +37,7 @@ from carlasc.storage.derived_copies import (
     DerivedSequence,
     sequences_with_scans,
 )
+from carlasc.storage.files import AnyPath
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter
@@ -63,8 +63,8 @@ class RefineResult(CopyResult):
 
 
 def refine(
-    source: str | os.PathLike[str] | Source,
-    out: str | os.PathLike[str],
+    source: AnyPath | Source,
+    out: AnyPath,
     *,
     poses: PoseOptions = PoseOptions(),  # noqa: B008 (frozen)
     overwrite: bool = False,

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from carlasc.errors import ArgumentError, ConflictError, FormatError, check_choi
 from carlasc.running.spreading import StepCounter
 from carlasc.storage.extraction import check_space, extract_zip, extracted_size
 from carlasc.storage.files import (
+    AnyPath,
     make_folder,
     parse_json,
     remove_file,
@@ -141,7 +141,7 @@ class DownloadResult:
 
 
 def download(
-    out: str | os.PathLike[str],
+    out: AnyPath,
     *,
     split: str | Sequence[str] = (),
     what: str = SEQUENCES,

@@ -6,7 +6,6 @@ Pictures, pages, recordings and windows take a `Scene` and read it with a `Scene
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, replace
@@ -27,12 +26,13 @@ from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_c
 from carlasc.metrics.grids import check_same_geometry, compare_grids
 from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.field_files import check_velocity
+from carlasc.storage.files import AnyPath
 from carlasc.storage.folder import FolderSequence
 from carlasc.storage.metadata import Axes
 from carlasc.viewing.colors import ACTORS, ERRORS, PALETTES, ClassColors, PaletteName, actor_ids
 from carlasc.viewing.photos import Photo, photos_of
 
-SceneSource = str | os.PathLike[str] | Source | Sequence
+SceneSource = AnyPath | Source | Sequence
 """The source of a scene: anything that `carlasc.open` takes, a grid's folder, the file of one
 frame, a Source or a Sequence.
 """
@@ -232,7 +232,7 @@ def find_sequence(source: SceneSource, wanted: str | Sequence | None = None) -> 
     return NamedPart(match)
 
 
-def _open_part(source: str | os.PathLike[str] | Source) -> NamedPart | None:
+def _open_part(source: AnyPath | Source) -> NamedPart | None:
     """Open a grid's folder or the file of one frame, in the folder of a grid or of one of a scan's
     fields; None if the source is neither.
     """

@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 import html
 import json
-import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -21,6 +20,7 @@ from typing import BinaryIO, overload
 
 from carlasc.errors import ArgumentError, ConflictError
 from carlasc.storage.files import (
+    AnyPath,
     check_target,
     make_folder,
     sync_all,
@@ -84,7 +84,7 @@ class ViewResult:
 @overload
 def view(
     source: Scene | SceneSource,
-    out: str | os.PathLike[str],
+    out: AnyPath,
     *,
     thin_m: float = ...,
     beside: SceneSource | None = ...,
@@ -107,7 +107,7 @@ def view(
 
 def view(
     source: Scene | SceneSource,
-    out: str | os.PathLike[str] | None = None,
+    out: AnyPath | None = None,
     *,
     thin_m: float = 0.2,
     beside: SceneSource | None = None,

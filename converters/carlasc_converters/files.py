@@ -4,7 +4,6 @@ that name the file.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -14,6 +13,7 @@ from carlasc.core.arrays import AnyArray
 from carlasc.errors import FormatError, MissingDataError, reading
 from carlasc.storage import layout
 from carlasc.storage.arrays import ArrayFormat, open_npz
+from carlasc.storage.files import AnyPath
 
 COPY = "the file may be cut short: copy it again"
 _OF_THE_LAYOUT = {*layout.scan_folders(), *layout.SPLITS, *layout.COORDINATES, layout.EVALUATION}
@@ -21,7 +21,7 @@ _MISSING = "check the path, or unpack the archive that contains it"
 
 
 @contextmanager
-def opening(path: str | os.PathLike[str], expected: str, advice: str = COPY) -> Iterator[None]:
+def opening(path: AnyPath, expected: str, advice: str = COPY) -> Iterator[None]:
     """Turn errors in a block that opens and reads one file into errors of carlasc.
 
     Args:
@@ -52,7 +52,7 @@ Version = tuple[int, int]
 """The version of a file: nanoseconds of its last change, and its size in bytes."""
 
 
-def version_of(path: str | os.PathLike[str], expected: str = "a file") -> Version:
+def version_of(path: AnyPath, expected: str = "a file") -> Version:
     """Return the version of a file, for the keys of caches.
 
     Raises:
@@ -64,7 +64,7 @@ def version_of(path: str | os.PathLike[str], expected: str = "a file") -> Versio
     return status.st_mtime_ns, status.st_size
 
 
-def read_bytes(path: str | os.PathLike[str], expected: str = "a file", advice: str = COPY) -> bytes:
+def read_bytes(path: AnyPath, expected: str = "a file", advice: str = COPY) -> bytes:
     """Return a whole file.
 
     Raises:
@@ -75,9 +75,7 @@ def read_bytes(path: str | os.PathLike[str], expected: str = "a file", advice: s
         return Path(path).read_bytes()
 
 
-def read_text(
-    path: str | os.PathLike[str], expected: str = "a text file", advice: str = COPY
-) -> str:
+def read_text(path: AnyPath, expected: str = "a text file", advice: str = COPY) -> str:
     """Return a whole text file in UTF-8.
 
     Raises:

@@ -9,7 +9,6 @@ properties; the rows of the elements follow.
 from __future__ import annotations
 
 import io
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
@@ -20,6 +19,7 @@ import numpy as np
 
 from carlasc.core.arrays import RecordArray
 from carlasc.errors import FormatError
+from carlasc.storage.files import AnyPath
 from carlasc_converters.files import opening
 
 _TYPES = {
@@ -54,7 +54,7 @@ class PlyVertices:
     lines: int | None = None
 
     @classmethod
-    def open(cls, path: str | os.PathLike[str], required: tuple[str, ...] = ()) -> Self:
+    def open(cls, path: AnyPath, required: tuple[str, ...] = ()) -> Self:
         """Read the header of a file.
 
         Args:

@@ -456,7 +456,10 @@ def test_constructing_prints_nothing_and_loads_neither_torch_nor_numba(world):
         ({"fields": ()}, "fields: expected at least one"),
         ({"history": 0}, "history: expected a number of scans of 1 or more, found 0"),
         ({"history": 2.5}, "history: expected a number of scans"),
-        ({"coordinates": "polar"}, "coordinates: expected one of cartesian, cylindrical, found 'polar'"),
+        (
+            {"coordinates": "polar"},
+            "coordinates: expected one of cartesian, cylindrical, found 'polar'",
+        ),
         ({"remap": "carlasc12"}, "remap: expected one of carlasc11.*found 'carlasc12'"),
         (
             {"remap": "carlasc12", "fields": ("points",)},

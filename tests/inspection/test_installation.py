@@ -156,7 +156,6 @@ def test_json_holds_the_same_figures():
         "fsspec",
         "lazy-loader",
         "numba",
-        "filelock",
         "numpy",
         "rich",
         "typer",

@@ -4,7 +4,6 @@ of the trajectory.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, replace
@@ -47,6 +46,7 @@ from carlasc.motion.refinement import MIN_SCANS, RefinedPoses
 from carlasc.motion.tracks import FIRST_FOUND, MovingActors, is_doubtful
 from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
+from carlasc.storage.files import AnyPath
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.resuming import RECORD
 from carlasc.storage.sinks import SequenceWriter
@@ -357,7 +357,7 @@ class ScanSequence(StoredSequence):
 
 
 def scan_sequences(
-    source: str | os.PathLike[str] | Source, plan: GridPlan, options: FromScans
+    source: AnyPath | Source, plan: GridPlan, options: FromScans
 ) -> list[SequenceInput]:
     """Find the sequences of a source that have scans.
 

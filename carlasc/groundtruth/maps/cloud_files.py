@@ -14,7 +14,6 @@ depth-first order. A tree has 16 levels, and its middle is at the origin. See A.
 from __future__ import annotations
 
 import io
-import os
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -28,7 +27,7 @@ from numpy.typing import NDArray
 from carlasc.core.arrays import AnyArray, AnyIntArray, BoolArray
 from carlasc.core.classes import ClassTable
 from carlasc.errors import ArgumentError, import_extra
-from carlasc.storage.files import write_output
+from carlasc.storage.files import AnyPath, write_output
 
 POINT_DTYPE = np.dtype(
     [
@@ -78,7 +77,7 @@ class PointPieces:
             yield rows
 
 
-def write_points(path: str | os.PathLike[str], points: PointPieces) -> None:
+def write_points(path: AnyPath, points: PointPieces) -> None:
     """Write points. The file suffix, one of `POINT_ENDINGS`, determines the format.
 
     Raises:
@@ -188,7 +187,7 @@ _ALL_FREE, _ALL_OCCUPIED = 0x5555, 0xAAAA  # eight equal children, which become 
 
 
 def write_octomap(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     cells: AnyIntArray,
     occupied: BoolArray,
     cell_m: float,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from carlasc.groundtruth.maps.cloud_files import (
     write_octomap,
     write_points,
 )
-from carlasc.storage.files import write_output, writing
+from carlasc.storage.files import AnyPath, write_output, writing
 
 OCTOMAP = ".bt"
 ACTORS = "actors.json"
@@ -246,7 +245,7 @@ class SurfaceMesh:
             np.concatenate(classes)[first],
         )
 
-    def write(self, path: str | os.PathLike[str], classes: ClassTable) -> None:
+    def write(self, path: AnyPath, classes: ClassTable) -> None:
         """Write the mesh with a colour for each vertex; the ending of the file, one of
         `MESH_ENDINGS`, says its format. In .glb, y is up.
 
@@ -309,7 +308,7 @@ def _march(
     return np.rint(_STEPS * vertices).astype(np.int64), triangles.astype(np.int64), labels
 
 
-def write_distances(path: str | os.PathLike[str], grid: Grid) -> None:
+def write_distances(path: AnyPath, grid: Grid) -> None:
     """Write the distance of each voxel from the surface: arrays `distance`, `lower`, `upper` and
     `voxel_size` in a .npz file.
 

@@ -5,7 +5,6 @@ of a drive.
 from __future__ import annotations
 
 import math
-import os
 import shutil
 import time
 from collections.abc import Iterator
@@ -42,7 +41,7 @@ from carlasc.motion.tracks import MovingActors
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
-from carlasc.storage.files import to_json, write_atomic, writing
+from carlasc.storage.files import AnyPath, to_json, write_atomic, writing
 from carlasc.storage.protocol import Sequence, Source
 
 _LEAST_CELL_M = 0.001  # smaller cells are finer than float32 positions
@@ -70,15 +69,15 @@ class MapResult:
 
 
 def map(
-    source: str | os.PathLike[str] | Source,
-    out: str | os.PathLike[str] | None = None,
+    source: AnyPath | Source,
+    out: AnyPath | None = None,
     *,
     cell_m: float = 0.05,
     frames: Frames = None,
     grid: str | None = None,
     actors: bool = False,
-    mesh: str | os.PathLike[str] | None = None,
-    distance: str | os.PathLike[str] | None = None,
+    mesh: AnyPath | None = None,
+    distance: AnyPath | None = None,
     motion: MotionOptions = MotionOptions(),  # noqa: B008 (frozen)
     poses: PoseOptions = PoseOptions(),  # noqa: B008 (frozen)
     overwrite: bool = False,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import os
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from carlasc.inspection.cards.readme import readme
 from carlasc.inspection.texts import say
 from carlasc.running.spreading import Run
 from carlasc.storage import as_source
-from carlasc.storage.files import parse_json, write_output
+from carlasc.storage.files import AnyPath, parse_json, write_output
 from carlasc.storage.parquet.parquet_source import ParquetSource
 from carlasc.storage.protocol import Source
 
@@ -60,8 +59,8 @@ class CardResult:
 
 
 def card(
-    source: str | os.PathLike[str] | Source,
-    out: str | os.PathLike[str] | None = None,
+    source: AnyPath | Source,
+    out: AnyPath | None = None,
     *,
     about: CardDetails = CardDetails(),  # noqa: B008 (frozen)
     pictures: bool = True,

@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 
 from carlasc.errors import ArgumentError
 from carlasc.storage import layout
+from carlasc.storage.files import AnyPath
 from carlasc.storage.parquet.parquet_source import FRAMES, ParquetSource, opened
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.transport.remote_tree import RemoteTree
@@ -135,9 +136,7 @@ class Place:
             return hashlib.file_digest(file, "sha256").hexdigest(), file.tell()
 
 
-def place_of(
-    source: str | os.PathLike[str] | Source, out: Path | None, url: str | None
-) -> tuple[Place, Path]:
+def place_of(source: AnyPath | Source, out: Path | None, url: str | None) -> tuple[Place, Path]:
     """Return the location of the data, and the folder of the card.
 
     The card is inside a folder of sequences or a Parquet store, because the Hugging Face Hub looks

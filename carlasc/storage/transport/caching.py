@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 from filelock import FileLock, Timeout
 
 from carlasc.errors import ArgumentError, MissingDataError, StorageError
-from carlasc.storage.files import sync_file, write_at
+from carlasc.storage.files import AnyPath, sync_file, write_at
 from carlasc.storage.transport.remote_tree import RemoteTree
 from carlasc.storage.transport.trees import LocalTree, Tree
 
@@ -51,7 +51,7 @@ class Cache:
         ArgumentError: `max_bytes` is not positive.
     """
 
-    folder: str | os.PathLike[str]
+    folder: AnyPath
     max_bytes: int = 64 << 30
 
     def __post_init__(self) -> None:

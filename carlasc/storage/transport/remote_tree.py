@@ -10,6 +10,7 @@ from functools import lru_cache, partial
 from typing import Any, TypeVar
 
 from carlasc.errors import MissingDataError, without_credentials
+from carlasc.storage.files import AnyPath
 from carlasc.storage.transport.clients import HUB, Client, FileSystemClient
 from carlasc.storage.transport.failures import WrongAnswerError, fail
 from carlasc.storage.transport.object_stores import SCHEMES, ObjectStoreClient
@@ -189,7 +190,7 @@ class RemoteTree(Tree):
 
 
 def tree_of(
-    place: str | os.PathLike[str], *, mapped: bool = True, **storage_options: Any
+    place: AnyPath, *, mapped: bool = True, **storage_options: Any
 ) -> LocalTree | RemoteTree:
     """Return the tree of files at a path or a URL. Nothing is read yet.
 

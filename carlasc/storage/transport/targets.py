@@ -15,7 +15,7 @@ from typing import Any
 
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.running.spreading import Run
-from carlasc.storage.files import leads_outside, write_atomic, write_many
+from carlasc.storage.files import AnyPath, leads_outside, write_atomic, write_many
 from carlasc.storage.transport.remote_tree import RemoteTree
 from carlasc.storage.transport.trees import LocalTree, Tree, is_url
 
@@ -101,7 +101,7 @@ class Target(ABC):
 class LocalTarget(Target):
     """A folder on this machine."""
 
-    def __init__(self, folder: str | os.PathLike[str]) -> None:
+    def __init__(self, folder: AnyPath) -> None:
         self.folder = Path(folder)
         self.location = str(self.folder)
         self.tree = LocalTree(self.folder)
@@ -212,7 +212,7 @@ class RemoteTarget(Target):
             self.tree.note(name, False)
 
 
-def target_of(out: str | os.PathLike[str] | Target, **storage_options: Any) -> Target:
+def target_of(out: AnyPath | Target, **storage_options: Any) -> Target:
     """Return the Target for a path or a URL.
 
     A Target is returned unchanged. Nothing is written yet.

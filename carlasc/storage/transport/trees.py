@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from carlasc.errors import CarlascError, FormatError, MissingDataError
+from carlasc.storage.files import AnyPath
 
 # Opening a pipe would hang without a writer; Windows would change the ends of lines.
 _READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
@@ -92,7 +93,7 @@ class Tree(ABC):
 class LocalTree(Tree):
     """A folder on this machine."""
 
-    def __init__(self, root: str | os.PathLike[str], *, mapped: bool = True) -> None:
+    def __init__(self, root: AnyPath, *, mapped: bool = True) -> None:
         """Create the tree of a folder.
 
         Args:

@@ -18,7 +18,7 @@ from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import Sequence as StoredSequence
 from carlasc.storage import Source
-from carlasc.storage.files import check_target
+from carlasc.storage.files import AnyPath, check_target
 from carlasc.viewing.colors import merge_legends
 from carlasc.viewing.rendering.actor_boxes import check_boxes
 from carlasc.viewing.rendering.cameras import CameraOptions, Viewpoint
@@ -92,7 +92,7 @@ class RenderResult:
 
 def render(
     source: Scene | SceneSource | Sequence[Scene | SceneSource],
-    out: str | os.PathLike[str] | None = None,
+    out: AnyPath | None = None,
     *,
     what: str | None = None,
     color: GridColor = "class",
@@ -202,7 +202,7 @@ def render(
 def _open_scenes(
     scenes: Sequence[Scene],
     what: str | None,
-    out: str | os.PathLike[str] | None,
+    out: AnyPath | None,
     *,
     orbit: bool,
     together: bool,

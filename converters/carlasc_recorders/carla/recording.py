@@ -5,7 +5,6 @@ format page, `docs/format.md#raw-capture`).
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,6 +23,7 @@ from carlasc.captures.settings import (
 from carlasc.captures.writing import CaptureWriter, TimesLog
 from carlasc.errors import ConflictError, MissingDataError, check_choice, import_extra
 from carlasc.storage.camera_files import cameras_to_json
+from carlasc.storage.files import AnyPath
 from carlasc.storage.layout import CAMERAS
 from carlasc_recorders.carla.sensors import CAMERA_KINDS, ActorNumbers, SensorRig
 from carlasc_recorders.carla.server import Server
@@ -71,7 +71,7 @@ class _ServerSettings:
 
 
 def record(
-    out: str | os.PathLike[str],
+    out: AnyPath,
     *,
     server: ServerOptions = ServerOptions(),  # noqa: B008 (frozen)
     town: str = "Town01",
