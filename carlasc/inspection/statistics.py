@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
@@ -28,8 +28,6 @@ Kind = Literal["points", "voxels"]
 KINDS: tuple[Kind, ...] = ("points", "voxels")
 _COUNT_APART = "count the sequences of each table separately"
 _CHUNK = 32  # frames per task of a worker
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import closing, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import sha256
 from itertools import groupby
@@ -62,20 +62,22 @@ _Row = tuple[str, int, int, int]
 class _Stretch:
     """Some successive frames of a sequence, which a worker counts, and the place of their sums."""
 
-    counter: FrameCounter
+    matched: MatchedGrids
+    window: tuple[int, int] | None
     frames: tuple[tuple[int, int], ...]
     writer: SequenceWriter | None
     scans: str  # digest
+    actors: MovingActors = field(default_factory=MovingActors)
 
     @cached_property
     def key(self) -> str:
         """The name of the sums, which differs for other grids, other scans or another window."""
-        one, content = self.counter.matched, sha256()
+        one, content = self.matched, sha256()
         for number, _ in self.frames:
             with suppress(CarlascError, OSError):  # which is reported when the frame is counted
                 for array in one.read(number):
                     content.update(b"" if array is None else array.tobytes())
-        about = (one.path, one.spec, self.frames, self.counter.window, self.scans)
+        about = (one.path, one.spec, self.frames, self.window, self.scans)
         return sha256(repr((_VERSION, *about, content.digest())).encode()).hexdigest()
 
     def read(self) -> Sums | None:
@@ -88,8 +90,8 @@ class _Stretch:
         """Count the frames, unless another run did; return those that cannot be read."""
         if (kept := self.read()) is not None:
             return kept, []
-        counter, sums = replace(self.counter), Sums()  # whose caches end with it
-        worst, failures = [], []
+        counter = FrameCounter(self.matched, self.actors, self.window)
+        sums, worst, failures = Sums(), [], []
         for number, frame in self.frames:
             try:
                 kinds = counter.add_frame(sums, number, frame)
@@ -106,8 +108,7 @@ class _Stretch:
 
     def failure(self, number: int, message: str) -> AuditFailure:
         """Return why a frame could not be counted."""
-        one = self.counter.matched
-        return AuditFailure(one.path, one.grids.name_of(number), message)
+        return AuditFailure(self.matched.path, self.matched.grids.name_of(number), message)
 
 
 def _sums_from(data: bytes, where: str) -> tuple[Sums, str]:
@@ -214,9 +215,8 @@ def _stretches_of(
         if layout.POSES in one.scans.documents():
             digest = derived_key(one.scans, scans, digest)
     size = int(np.clip(len(one.frames) // _STRETCHES, 1, _STRETCH))
-    counter = FrameCounter(one, MovingActors(), window)
     for first in range(0, len(one.frames), size):
-        yield _Stretch(counter, one.frames[first : first + size], writer, digest)
+        yield _Stretch(one, window, one.frames[first : first + size], writer, digest)
 
 
 def _with_actors(stretches: Iterable[_Stretch], run: Run, notes: list[str]) -> Iterator[_Stretch]:
@@ -224,7 +224,7 @@ def _with_actors(stretches: Iterable[_Stretch], run: Run, notes: list[str]) -> I
 
     Actors are found for some hundred frames at a time, to bound memory.
     """
-    blocks = groupby(stretches, lambda one: (one.counter.matched.path, one.frames[0][1] // _BLOCK))
+    blocks = groupby(stretches, lambda one: (one.matched.path, one.frames[0][1] // _BLOCK))
     for (_, block), parts in blocks:
         actors = None
         for stretch in parts:
@@ -234,9 +234,8 @@ def _with_actors(stretches: Iterable[_Stretch], run: Run, notes: list[str]) -> I
             first, last = stretch.frames[0][1], stretch.frames[-1][1]
             if actors is None:
                 end = (block + 1) * _BLOCK + last - first
-                actors = _actors_of(stretch.counter.matched, block * _BLOCK, end, run, notes)
-            near = actors.between(first - _REACH, last + _REACH)
-            yield replace(stretch, counter=replace(stretch.counter, actors=near))
+                actors = _actors_of(stretch.matched, block * _BLOCK, end, run, notes)
+            yield replace(stretch, actors=actors.between(first - _REACH, last + _REACH))
 
 
 def _actors_of(
@@ -272,7 +271,7 @@ def _count_all(
     own = run.part.take(range(len(stretches)))
     steps = StepCounter(run.progress, sum(len(stretch.frames) for stretch in stretches))
     steps(0)
-    lengths = Counter(stretch.counter.matched.path for stretch in stretches)
+    lengths = Counter(stretch.matched.path for stretch in stretches)
     sums = {path: [Sums() for _ in range(min(length, _DRAWN))] for path, length in lengths.items()}
     worst, failures, is_whole, rows = list[_Row](), list[AuditFailure](), True, Counter[str]()
     tasks = _with_actors((stretches[index] for index in own), run, notes)
@@ -280,7 +279,7 @@ def _count_all(
         for index, stretch in enumerate(stretches):
             counted, failed = next(results) if index in own else (stretch.read(), [])
             is_whole &= counted is not None
-            counts, path = {**(counted or {})}, stretch.counter.matched.path
+            counts, path = {**(counted or {})}, stretch.matched.path
             steps(len(stretch.frames))
             failures += failed
             worst += [(path, *row) for row in counts.pop(_WORST, np.empty(0)).tolist()]
