@@ -21,7 +21,7 @@ import numpy as np
 from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray
 from carlasc.core.axes import choices_of_axes
 from carlasc.core.geometry import Transform, invert, transform_points, translation
-from carlasc.inspection.pose_quality import PoseQuality, measure_poses
+from carlasc.inspection.pose_quality import PoseQuality, angles_of, measure_poses
 from carlasc.inspection.structure import VOXEL_M, occupancy, overlap
 
 Poses: TypeAlias = FloatArray
@@ -133,10 +133,10 @@ def diagnose_poses(
         occupied = occupancy(target)
         ends = np.stack([candidate[[earlier, later]] for candidate in corrected])
         motions = invert(ends[:, 0]) @ ends[:, 1]
-        distances = [_extent(between) for between in invert(motions) @ motions[0]]
+        distances = _extent(invert(motions) @ motions[0])
         own = overlap(occupied, motions[0], moved)
         overlaps.append((target, _thin(source, _OFFSET_POINTS), motions[0]))
-        judged.append([distance > _JUDGED_M for distance in distances])
+        judged.append(distances > _JUDGED_M)
         shares.append(
             [
                 overlap(occupied, motion, moved) if distance > _SAME_M else own
@@ -169,7 +169,7 @@ def choose_pairs(poses: Poses, max_pairs: int) -> list[tuple[int, int]]:
     spread = {
         candidates[i] for i in np.linspace(0, len(candidates) - 1, (max_pairs + 1) // 2).astype(int)
     }
-    turns = [_angle(relative(poses, first, second)) for first, second in candidates]
+    turns = angles_of(np.stack([relative(poses, *pair) for pair in candidates]))
     turning = [candidates[i] for i in np.argsort(turns)[::-1] if candidates[i] not in spread]
     # neighbouring pairs are in the same turn, so only every third of the sharpest is taken
     return sorted(spread | set(turning[: 3 * (max_pairs // 2) : 3]))
@@ -314,7 +314,7 @@ def _partner(poses: Poses, first: int) -> int:
         return min(first + (1, 4)[first % 2], last)
     for second in range(first + 1, last):
         motion = relative(poses, first, second)
-        if np.linalg.norm(motion[:3, 3]) >= _STRIDE_M or _angle(motion) >= _STRIDE_RAD:
+        if np.linalg.norm(motion[:3, 3]) >= _STRIDE_M or angles_of(motion) >= _STRIDE_RAD:
             return second
     return last
 
@@ -323,13 +323,9 @@ def _thin(points: FloatArray, count: int) -> FloatArray:
     return points[:: max(1, len(points) // count)]
 
 
-def _angle(motion: Transform) -> float:
-    return float(np.arccos(np.clip((np.trace(motion[:3, :3]) - 1) / 2, -1.0, 1.0)))
-
-
-def _extent(motion: Transform) -> float:
-    """Return about how far, in metres, a motion moves a point that is 15 m away."""
-    return float(np.linalg.norm(motion[:3, 3]) + _LEVER_M * _angle(motion))
+def _extent(motions: FloatArray) -> FloatArray:
+    """Return about how far, in metres, (..., 4, 4) motions move a point that is 15 m away."""
+    return np.linalg.norm(motions[..., :3, 3], axis=-1) + _LEVER_M * angles_of(motions)
 
 
 def _transpose(poses: Poses) -> Poses:

@@ -334,7 +334,8 @@ def _others(
     """
     wrong = values[~right]
     if wrong.size:
-        yield expected, f"{wrong[0]:g}, and {wrong.size - 1} other such {kind}"
+        first = format(wrong[0], "g" if wrong.dtype.kind == "f" else "d")
+        yield expected, f"{first}, and {wrong.size - 1} other such {kind}"
 
 
 def _check_classes(labels: AnyIntArray, classes: ClassTable, where: str) -> Iterator[Finding]:
@@ -355,12 +356,7 @@ def _first_of(frames: set[int]) -> str:
 
 def _fields(sequence: Sequence, frame: int) -> list[str]:
     """Return the fields that a frame has."""
-    frames = {name: sequence.frames(name) for name in sequence.fields()}
-    return [
-        name
-        for name, numbers in frames.items()
-        if frame in numbers[np.searchsorted(numbers, frame) :][:1]
-    ]
+    return [name for name in sequence.fields() if frame in sequence.frames(name)]
 
 
 def _file(sequence: Sequence, field: str, frame: int) -> str:

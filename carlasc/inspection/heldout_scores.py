@@ -136,7 +136,7 @@ class HeldOutScores:
         else:
             ground, kinds = np.isin(grid.labels, sorted(classes.ground)), labels.astype(np.int64)
         solid = np.where(occupied, np.where(ground, _SOLID, _SOLID | _OBJECT), 0).astype(np.uint8)
-        at_points = labels_at(points, spec, grid.labels, grid.known)[0, 0]
+        at_points = labels_at(points, spec, grid.labels, grid.known)
         inside = (at_points != OUTSIDE) & np.any(points != 0, axis=1)
         begun = np.zeros_like(points) if origins is None else origins
         ends, begun = points[inside].astype(np.float64), begun[inside].astype(np.float64)
@@ -188,11 +188,9 @@ class HeldOutScores:
 
     def by_distance(self) -> dict[str, RayShares]:
         """Return the rays of each band of distances, by its name, such as "10-20 m"."""
-        shares = {}
-        for i, (low, high) in enumerate(pairwise(BANDS_M)):
-            name = f"{low:.0f}-{high:.0f} m" if np.isfinite(high) else f"{low:.0f} m and more"
-            shares[name] = self._shares((slice(None), i))
-        return shares
+        names = [f"{low:.0f}-{high:.0f} m" for low, high in pairwise(BANDS_M[:-1])]
+        names.append(f"{BANDS_M[-2]:.0f} m and more")
+        return {name: self._shares((slice(None), i)) for i, name in enumerate(names)}
 
     def to_dict(self) -> dict[str, Any]:
         """Return all figures as plain values for JSON."""
@@ -212,12 +210,11 @@ class HeldOutScores:
     def _shares(self, chosen: Any) -> RayShares:
         """Return the shares of the rays of some classes and bands, by an index of both."""
         returns, free, unknown, *others = _summed(self.counts[chosen]).tolist()
-        shares = (
-            part / returns if returns else None
-            for part in (free, unknown, returns - free - unknown, *others)
-        )
+        counts = (free, unknown, returns - free - unknown, *others)
         errors = _summed(self.errors[chosen])
-        return RayShares(returns, *shares, _quantile(errors, 0.5), _quantile(errors, 0.9))
+        shares = [part / returns if returns else None for part in counts]
+        shares += [_quantile(errors, 0.5), _quantile(errors, 0.9)]
+        return RayShares(returns, *shares)
 
 
 def _summed(counts: IntArray) -> IntArray:
@@ -232,20 +229,15 @@ def swept_voxels(spec: GridSpec, grid_T_vehicles: Iterable[Transform]) -> BoolAr
         spec: geometry of the grid, Cartesian.
         grid_T_vehicles: (4, 4) poses of the vehicle's sensor in the frame of the grid, x forward.
     """
-    swept = np.zeros(spec.size, np.bool_)
-    lower, upper = np.array(VEHICLE_M)
-    corners = np.array(np.meshgrid(*zip(lower, upper, strict=True))).reshape(3, -1).T
+    centers, (lower, upper) = spec.centers(), np.array(VEHICLE_M)
+    axes = (centers[:, 0, 0, 0], centers[0, :, 0, 1], centers[0, 0, :, 2])
+    swept, reach_m = np.zeros(spec.size, np.bool_), np.linalg.norm(np.abs(VEHICLE_M).max(axis=0))
     for pose in grid_T_vehicles:
-        placed = (transform_points(pose, corners) - np.array(spec.lower)) / spec.voxel_size
-        first = np.clip(np.floor(placed.min(axis=0)).astype(int), 0, spec.size)
-        stop = np.clip(np.ceil(placed.max(axis=0)).astype(int), 0, spec.size)
-        cells = np.stack(np.meshgrid(*map(np.arange, first, stop), indexing="ij"), axis=-1).reshape(
-            -1, 3
+        near = np.ix_(
+            *(np.abs(axis - at) < reach_m for axis, at in zip(axes, pose[:3, 3], strict=True))
         )
-        centers = np.array(spec.lower) + (cells + 0.5) * spec.voxel_size
-        body = transform_points(invert(pose), centers)
-        i, j, k = cells[((body > lower) & (body < upper)).all(axis=1)].T
-        swept[i, j, k] = True
+        body = transform_points(invert(pose), centers[near])
+        swept[near] |= ((body > lower) & (body < upper)).all(axis=-1)
     return swept
 
 

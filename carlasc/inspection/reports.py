@@ -11,9 +11,8 @@ from typing import Any
 from carlasc.core.frames import FrameRange
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, MissingDataError
 from carlasc.groundtruth import FrameFailure, FromScans, Voting
-from carlasc.groundtruth.from_scans.motion_pass import find_actors
-from carlasc.groundtruth.from_scans.sequences import ScanFrame, ScanSequence
-from carlasc.groundtruth.inputs import GridPlan, without_caches
+from carlasc.groundtruth.from_scans.sequences import ScanSequence
+from carlasc.groundtruth.inputs import FrameInput, GridPlan, without_caches
 from carlasc.groundtruth.reporting import Changes, FrameFacts, Report, sample_frames
 from carlasc.inspection.heldout import EVERY
 from carlasc.inspection.heldout import holdout as leave_out
@@ -139,7 +138,7 @@ class _ReportedFrame:
     sequence: Sequence
     grid: str
     number: int
-    scans: ScanFrame | None  # the scans that it was made from
+    scans: FrameInput | None  # the scans that it was made from
     plan: GridPlan | None  # to make the grid again without a tenth of the scans
 
 
@@ -161,9 +160,7 @@ class _ReportMaker:
         sequence, inputs = self.sequence, self.inputs
         try:
             if inputs is not None:
-                inputs.refine(None, run, steps)
-                if inputs.feed.needs_actors:
-                    inputs.actors = find_actors(inputs.feed, run, steps)
+                inputs.prepare(None, run, steps)
         except (CarlascError, OSError):  # the error is reported when the frame is measured
             self.inputs = inputs = None
         facts, failures = list[FrameFacts](), list[FrameFailure]()
@@ -187,10 +184,8 @@ class _ReportMaker:
     def _tasks(self) -> Iterator[_ReportedFrame]:
         light, sampled = without_caches(self.sequence), sample_frames(self.frames)
         for number in self.frames:
-            scans, plan = None, None
-            if self.inputs is not None and number in self.inputs.feed.frames:
-                scans = ScanFrame(self.inputs, number, number)
-                plan = self.inputs.plan if number in sampled else None
+            scans = None if self.inputs is None else self.inputs.frame(number)
+            plan = self.inputs.plan if self.inputs is not None and number in sampled else None
             yield _ReportedFrame(light, self.grid, number, scans, plan)
 
     def held_out(self, run: Run) -> Mapping[str, Any] | None:
@@ -270,9 +265,12 @@ def _measure(task: _ReportedFrame) -> FrameFacts | FrameFailure:
             if n in present and number in sequence.frames(n)
         }
         spec, classes, changes = sequence.grids[grid], sequence.classes_of(grid), None
-        if task.scans is not None and task.plan is not None:
-            changes = Changes.between(sequence.grid(grid, number), task.scans.thinned(task.plan))
         residuals = None if task.scans is None else task.scans.residuals()
+        thinned = None
+        if task.scans is not None and task.plan is not None:
+            thinned = task.scans.thinned(task.plan)
+        if thinned is not None:
+            changes = Changes.between(sequence.grid(grid, number), thinned)
         return FrameFacts.of(number, arrays, grid, spec, classes, changes, residuals)
     except (CarlascError, OSError) as error:
         return FrameFailure(sequence.location, number, str(error))

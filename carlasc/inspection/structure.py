@@ -70,7 +70,7 @@ def structure_of(
     Returns:
         (M, 3) float64 points, metres, in the frame of the sensor.
     """
-    keep = within(points, points.dtype.type(MIN_RANGE_M), points.dtype.type(MAX_RANGE_M))
+    keep = within(points, MIN_RANGE_M, MAX_RANGE_M)
     if labels is not None and bool(labels.any()):
         keep &= _static_classes(classes)[
             # packed stores keep labels in uint8

@@ -181,10 +181,9 @@ class _CheckedFrames:
 
 
 def _plan(sequence: Sequence, every: int | None) -> _CheckedFrames:
-    numbers: set[int] = set()
+    numbers = set[int]()
     with suppress(CarlascError):  # which is reported when the sequence is examined
-        for name in sequence.fields():
-            numbers.update(sequence.frames(name).tolist())
+        numbers.update(*(sequence.frames(name).tolist() for name in sequence.fields()))
     frames = tuple(sorted(numbers))
     read = frames[:: every or max(1, len(frames) // _SAMPLES)]
     # opening a local file is cheap; a frame of a packed store must be decoded, and has the right
@@ -377,7 +376,7 @@ def _largest_edge(spec: GridSpec) -> float:
 def _judge_poses(sequence: Sequence, diagnosis: PoseDiagnosis) -> Iterator[Finding]:
     quality, correction = diagnosis.quality, diagnosis.correction
     mounting = None if quality is None else quality.mounting
-    described = None if mounting is None else describe_mounting(mounting, layout.FRAME_PERIOD_S)
+    described = None if mounting is None else describe_mounting(mounting)
     check, expected = "poses-on-scans", "scans that overlap under the poses"
     overlap = f"{diagnosis.share:.1%} of a scan's structure overlaps that of an earlier scan"
     severity: Severity = "warning"

@@ -169,8 +169,9 @@ def audit(
     stretches = [part for one in matched for part in _stretches_of(one, made_from, keep)]
     with one_pool(run) as spread:
         sums, worst, failures = _count_all(stretches, spread, notes)
-    judged = matched if sums is not None else []
-    verdicts = {one.path: _judge(Stretches(sums[one.path]), one, made_from) for one in judged}
+    verdicts = {}
+    if sums is not None:
+        verdicts = {one.path: _judge(Stretches(sums[one.path]), one, made_from) for one in matched}
     return AuditResult(
         grids.location if isinstance(grids, Source) else str(grids),
         scans.location if isinstance(scans, Source) else str(scans),
@@ -282,7 +283,8 @@ def _count_all(
             counts, path = {**(counted or {})}, stretch.matched.path
             steps(len(stretch.frames))
             failures += failed
-            worst += [(path, *row) for row in counts.pop(_WORST, np.empty(0)).tolist()]
+            rows_of = counts.pop(_WORST, np.empty((0, 3), np.int64)).tolist()
+            worst += [(path, number, frame, wrong) for number, frame, wrong in rows_of]
             for name, array in counts.items():
                 add(sums[path][rows[path] * len(sums[path]) // lengths[path]], name, array)
             rows[path] += 1

@@ -20,12 +20,13 @@ from carlasc.core.arrays import (
     LabelArray,
     Uint8Array,
 )
-from carlasc.core.cells import first_of_cells
+from carlasc.core.cells import Cells, count_points, find_voxel, first_of_cells
+from carlasc.core.compiling import cached
 from carlasc.core.geometry import invert, thin, transform_points
+from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan
 from carlasc.errors import CarlascError
 from carlasc.inspection.auditing.geometry import families
-from carlasc.inspection.auditing.loops import crossings, grown, voxels_at
 from carlasc.inspection.auditing.matching import MatchedGrids
 from carlasc.inspection.auditing.verdicts import Sums, add
 from carlasc.inspection.heldout_scores import BANDS_M, lowest_of_columns
@@ -164,7 +165,7 @@ class FrameCounter:
         self, seen: _Frame, warps: FloatArray, points: FloatArray, later_s: float = 0.0
     ) -> IntArray:
         spec, occupied = self.matched.spec, seen.occupied
-        at_points = labels_at(points, spec, occupied, warps=warps, later_s=later_s)[:, 0]
+        at_points = labels_at(points, spec, occupied, warps=warps, later_s=later_s)
         return np.column_stack([np.full(len(warps), len(points)), (at_points > 0).sum(axis=1)])
 
     @property
@@ -251,13 +252,12 @@ class FrameCounter:
         """Count returns in free voxels by class, distance and height, and return these voxels."""
         wrong = np.zeros(seen.occupied.shape, np.bool_)
         if seen.known is not None:
-            at_points = labels_at(seen.points, self.matched.spec, seen.occupied, seen.known)[0, 0]
-            own = np.flatnonzero((at_points >= 0) & (seen.voxels >= 0))
-            free = at_points[own] == 0
+            own = np.flatnonzero(seen.voxels >= 0)
+            own = own[seen.known.reshape(-1)[seen.voxels[own]]]
+            free = ~seen.occupied.reshape(-1)[seen.voxels[own]]
             wrong.reshape(-1)[seen.voxels[own[free]]] = True
-            kinds = (
-                np.zeros(len(own), np.int64) if seen.scan.labels is None else seen.scan.labels[own]
-            )
+            labels = seen.scan.labels
+            kinds = np.zeros(len(own), np.int64) if labels is None else labels[own]
             self._add_by(sums, "returns", kinds, seen.points[own], free)
         return wrong
 
@@ -391,7 +391,10 @@ class FrameCounter:
             for a, b in zip(lower, upper, strict=True)
         ]
         lattice = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
-        return voxels_at(lattice, grid_T_world @ np.stack(poses), spec)
+        counts = np.zeros(spec.num_voxels, np.int32)
+        for pose in poses:
+            count_points(lattice, grid_T_world @ pose, spec, counts)
+        return np.flatnonzero(counts)
 
 
 def _are_returns(scan: Scan) -> BoolArray:
@@ -405,3 +408,57 @@ def _name(number: int, track: Track) -> str:
         return str(track.instance)
     first = min(track.members, default=track.first)
     return f"of track {number}, first seen in scan {first}"
+
+
+_SAMPLES = 4  # samples on a ray per edge of the smallest voxel
+# least samples of a ray in a voxel that it crosses: rays that graze a corner do not count
+_INSIDE = 3
+
+
+def crossings(origins: FloatArray, points: FloatArray, spec: GridSpec, margin_m: float) -> IntArray:
+    """Return (X, Y, Z) how many rays cross each voxel, not only a corner of it, before they come
+    near their return.
+
+    Args:
+        origins: (N, 3) metres, where each ray begins, in the frame of the grid.
+        points: (N, 3) metres, the returns.
+        spec: geometry of the grid, Cartesian or cylindrical.
+        margin_m: rays end this far before their return.
+    """
+    crossed = np.zeros(spec.num_voxels + 1, np.int64)
+    edges = spec.voxel_size[[0, 2]] if spec.coordinates == "cylindrical" else spec.voxel_size
+    _cross(origins, points, Cells.of(spec), float(min(edges)) / _SAMPLES, margin_m, crossed)
+    return crossed[:-1].reshape(spec.size)
+
+
+@cached
+def _cross(origins, points, cells, step_m, margin_m, crossed):  # type: ignore[no-untyped-def]
+    outside = len(crossed) - 1
+    for i in range(len(points)):
+        x, y, z = origins[i, 0], origins[i, 1], origins[i, 2]
+        dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
+        if not length > margin_m:
+            continue
+        dx, dy, dz = dx / length, dy / length, dz / length
+        last, inside = outside, 0
+        for k in range(int((length - margin_m) / step_m)):
+            t = (k + 0.5) * step_m
+            voxel = find_voxel(x + t * dx, y + t * dy, z + t * dz, cells)
+            inside = inside + 1 if voxel == last else 1
+            last = voxel
+            if inside == _INSIDE:
+                crossed[voxel] += 1
+
+
+def grown(mask: BoolArray, turns: bool) -> BoolArray:
+    """Return a mask grown by one voxel in each direction; if `turns`, the azimuth of a cylindrical
+    grid is periodic.
+    """
+    for axis in range(3):
+        sides = [(1, 1) if a == axis else (0, 0) for a in range(3)]
+        wide = np.moveaxis(
+            np.pad(mask, sides, mode="wrap" if turns and axis == 1 else "constant"), axis, 0
+        )
+        mask = np.moveaxis(wide[:-2] | wide[1:-1] | wide[2:], 0, axis)
+    return mask

@@ -323,8 +323,9 @@ def _token_times(grids: TokenFrames) -> dict[str, float] | None:
 def _height_of(scans: Sequence) -> float | None:
     sensors = scans.metadata.extra.get("sensors")
     first = sensors[0] if isinstance(sensors, list) and sensors else None
-    height = first.get("height_m") if isinstance(first, dict) else None
-    return float(height) if type(height) in (int, float) else None
+    height: Any = first.get("height_m") if isinstance(first, dict) else None
+    is_number = isinstance(height, int | float) and not isinstance(height, bool)
+    return float(height) if is_number else None
 
 
 def _mapping(

@@ -157,12 +157,9 @@ def _inline(table: Table) -> Json:
     name, kinds = _id(table.name), {str: "sc:Text", int: "sc:Integer"}
     fields = {
         column: {"dataType": kinds.get(type(value), "sc:Float")}
-        for column, value in zip(table.columns, table.rows[0], strict=True)
+        for column, value in table.rows[0].items()
     }
-    records = [
-        {f"{name}/{column}": value for column, value in zip(table.columns, row, strict=True)}
-        for row in table.rows
-    ]
+    records = [{f"{name}/{column}": row[column] for column in row} for row in table.rows]
     return _record_set(name, table.title, fields, data=records)
 
 

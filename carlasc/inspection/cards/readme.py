@@ -167,11 +167,11 @@ def _opening(facts: Facts, place: Place, tables: Sequence[PublishedTable]) -> st
 
 def _section(tables: Sequence[Table], name: str) -> str:
     text = []
-    for table in tables:
-        if table.section == name:
-            text += [_text(table.title), _table(table.columns, table.rows[:_MOST_ROWS])]
-            if len(table.rows) > _MOST_ROWS:
-                text.append(say("more_rows", count=len(table.rows) - _MOST_ROWS))
+    for _, _, title, rows in (table for table in tables if table.section == name):
+        shown = [list(row.values()) for row in rows[:_MOST_ROWS]]
+        text += [_text(title), _table([*rows[0]], shown)]
+        if len(rows) > _MOST_ROWS:
+            text.append(say("more_rows", count=len(rows) - _MOST_ROWS))
     return "\n\n".join(text) or "None."
 
 
