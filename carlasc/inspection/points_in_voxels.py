@@ -50,9 +50,19 @@ def labels_at(
     if warps is None:
         voxels = spec.flat_index(exact)
         return values[voxels if shifts is None else _shifted(voxels, spec, shifts)]
+    return values[warped_voxels(exact, spec, warps, later_s)]
+
+
+def warped_voxels(
+    points: FloatArray, spec: GridSpec, warps: FloatArray, later_s: float = 0.0
+) -> IntArray:
+    """Return (W, N) voxels of points under maps, as in `labels_at`; outside, the number of voxels.
+
+    It is compiled, because many maps are tried on the same points.
+    """
     voxels = np.empty((len(warps), len(points)), np.int64)
-    _find(exact, np.ascontiguousarray(warps), later_s, Cells.of(spec), voxels)
-    return values[voxels]
+    _find(points, np.ascontiguousarray(warps), later_s, Cells.of(spec), voxels)
+    return voxels
 
 
 def _shifted(voxels: IntArray, spec: GridSpec, shifts: IntArray) -> IntArray:

@@ -12,9 +12,10 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray, AnyFloatArray, BoolArray, FloatArray
 from carlasc.core.classes import ClassTable
-from carlasc.core.geometry import Transform, transform_points
+from carlasc.core.geometry import Transform
 from carlasc.core.grids import GridSpec
 from carlasc.errors import CarlascError
+from carlasc.inspection.points_in_voxels import warped_voxels
 from carlasc.storage.protocol import Sequence
 
 MIN_RANGE_M = 3.0
@@ -148,5 +149,5 @@ def overlap(occupied: BoolArray, motion: Transform, points: FloatArray) -> float
         motion: (4, 4) other_T_scan.
         points: (N, 3) metres, N > 0.
     """
-    cells, inside = _SPACE.index(transform_points(motion, points))
-    return float((occupied[tuple(cells.T)] & inside).mean())
+    (voxels,) = warped_voxels(points, _SPACE, np.pad(motion[None, :3], ((0, 0), (0, 0), (0, 1))))
+    return np.count_nonzero(occupied.reshape(-1)[voxels[voxels < occupied.size]]) / len(points)
