@@ -701,5 +701,5 @@ def check_poses(recording: Recording, converter: Converter, poses: FloatArray) -
             f"{_ACCEPT}",
         )
     mounting = None if diagnosis.quality is None else diagnosis.quality.mounting
-    described = None if mounting is None else describe_mounting(mounting, layout.FRAME_PERIOD_S)
+    described = None if mounting is None else describe_mounting(mounting)
     return None if described is None else f"{described[0]}: {described[1]}, or {_ESTIMATE}"

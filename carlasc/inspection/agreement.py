@@ -162,9 +162,9 @@ class GridEvidence:
         """
         chosen = np.arange(len(points)) if labels is None else np.flatnonzero(labels)
         chosen = chosen[:: max(1, len(chosen) // _MAX_POINTS)]
-        shifted = labels_at(points[chosen], grid.spec, grid.labels, grid.known, shifts=_SHIFTED)[0]
-        turned = labels_at(points[chosen], grid.spec, grid.labels, grid.known, warps=_TURNED)[:, 0]
-        at_points = np.concatenate([shifted[:1], turned, shifted[1:]])
+        about = (points[chosen], grid.spec, grid.labels, grid.known)
+        as_is, *shifted = labels_at(*about, shifts=_SHIFTED)
+        at_points = np.stack([as_is, *labels_at(*about, warps=_TURNED), *shifted])
         known, occupied = at_points >= 0, at_points > 0
         counted = known.sum(axis=1)
         if counted[: 1 + len(_AXES)].max() < _MIN_POINTS:

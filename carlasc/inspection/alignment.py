@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TypeAlias
 
@@ -20,7 +20,7 @@ import numpy as np
 
 from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray
 from carlasc.core.geometry import Transform, choices_of_axes, invert, transform_points, translation
-from carlasc.inspection.pose_quality import PoseQuality, measure_poses
+from carlasc.inspection.pose_quality import PoseQuality, angles_of, measure_poses
 from carlasc.inspection.structure import VOXEL_M, occupancy, overlap
 
 Poses: TypeAlias = FloatArray
@@ -42,7 +42,6 @@ _GAIN = 0.02  # a correction must raise the mean share of overlap by this,
 _CERTAIN = 4.0  # and by this number of standard errors
 _WINS = 0.75  # on this share of the pairs on which it makes a difference,
 _JUDGED_M = 0.05  # where the two motions differ by more than this
-_COMMON_AXES = 5  # the choices of axes that are listed first
 _SAME_M = 0.002  # motions that are nearer than this are the same
 _EXPLAINED = 0.2  # and the mean share must be at least this then
 # Vehicles that drive as fast as the ego vehicle look like scans that are all in one frame. In dense
@@ -133,10 +132,10 @@ def diagnose_poses(
         occupied = occupancy(target)
         ends = np.stack([candidate[[earlier, later]] for candidate in corrected])
         motions = invert(ends[:, 0]) @ ends[:, 1]
-        distances = [_extent(between) for between in invert(motions) @ motions[0]]
+        distances = _extent(invert(motions) @ motions[0])
         own = overlap(occupied, motions[0], moved)
         overlaps.append((target, _thin(source, _OFFSET_POINTS), motions[0]))
-        judged.append([distance > _JUDGED_M for distance in distances])
+        judged.append(distances > _JUDGED_M)
         shares.append(
             [
                 overlap(occupied, motion, moved) if distance > _SAME_M else own
@@ -169,7 +168,7 @@ def choose_pairs(poses: Poses, max_pairs: int) -> list[tuple[int, int]]:
     spread = {
         candidates[i] for i in np.linspace(0, len(candidates) - 1, (max_pairs + 1) // 2).astype(int)
     }
-    turns = [_angle(relative(poses, first, second)) for first, second in candidates]
+    turns = angles_of(np.stack([relative(poses, *pair) for pair in candidates]))
     turning = [candidates[i] for i in np.argsort(turns)[::-1] if candidates[i] not in spread]
     # neighbouring pairs are in the same turn, so only every third of the sharpest is taken
     return sorted(spread | set(turning[: 3 * (max_pairs // 2) : 3]))
@@ -179,28 +178,61 @@ def known_corrections() -> tuple[Correction, ...]:
     """Return the known mistakes, common ones first: if several fit equally well, the first is
     reported.
     """
-    mistakes = enumerate(_axes_mistakes())
-    axes = [
-        Correction(name, advice, _in_axes(matrix), rank >= _COMMON_AXES)
-        for rank, (name, advice, matrix) in mistakes
+    mirrored = np.diag([1.0, -1.0, 1.0])
+    # x right, y down, z forward, from x forward, y left, z up
+    of_kitti = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    cameras = (of_kitti, of_kitti @ mirrored)
+    mirrored_cameras = [mirrored @ camera for camera in cameras]
+    camera_advice = "convert them to the frame of the LiDAR: inv(Tr) @ P @ Tr, Tr from calib.txt"
+    corrections = [
+        _of_axes(
+            "poses with y mirrored against the scans",
+            "give scans and poses the same handedness: mirror y in both (S @ P @ S with S = "
+            "diag(1, -1, 1, 1)) or in neither",
+            mirrored,
+        ),
+        Correction(
+            "transposed rotations",
+            "write R instead of its transpose (the matrices were probably read column by column)",
+            _transpose,
+        ),
+        Correction(
+            "inverted transforms (first frame to sensor)",
+            "invert the transforms: they must lead from the sensor to the first frame",
+            invert,
+        ),
     ]
-    transposed = Correction(
-        "transposed rotations",
-        "write R instead of its transpose (the matrices were probably read column by column)",
-        _transpose,
-    )
-    inverted = Correction(
-        "inverted transforms (first frame to sensor)",
-        "invert the transforms: they must lead from the sensor to the first frame",
-        invert,
-    )
+    name = "camera-frame poses (x right, y down, z forward)"
+    corrections += [_of_axes(name, camera_advice, camera) for camera in cameras]
+    name = "camera-frame poses with y mirrored"
+    corrections += [_of_axes(name, camera_advice, camera) for camera in mirrored_cameras]
+    known = (np.eye(3), mirrored, *cameras, *mirrored_cameras)
+    for names, matrix in choices_of_axes():
+        if not any(np.array_equal(matrix, other) for other in known):
+            kind, advice = (
+                "poses in other axes than the scans",
+                "convert them to the axes of the scans",
+            )
+            if names[-1] == "x":
+                kind, advice = "camera-frame poses", camera_advice
+            name = f"{kind} (x, y, z are {names})"
+            corrections.append(replace(_of_axes(name, advice, matrix), rare=True))
     standing = Correction(
         "scans that are all in one frame, with the poses of a moving sensor",
         "move each scan to the frame of its own sensor, or take the poses of this sequence",
         lambda p: np.tile(np.eye(4), (len(p), 1, 1)),
         factor=_STANDING,
     )
-    return (axes[0], transposed, inverted, *axes[1:], standing)
+    return (*corrections, standing)
+
+
+def _of_axes(name: str, advice: str, stored_T_sensor: FloatArray) -> Correction:
+    """Return the correction of a change of axes: `stored_T_sensor` (3, 3) maps the axes of the
+    sensor to those of the stored poses.
+    """
+    change = np.eye(4)
+    change[:3, :3] = stored_T_sensor
+    return Correction(name, advice, lambda poses: change.T @ poses @ change)
 
 
 def relative(poses: Poses, earlier: int, later: int) -> Transform:
@@ -281,7 +313,7 @@ def _partner(poses: Poses, first: int) -> int:
         return min(first + (1, 4)[first % 2], last)
     for second in range(first + 1, last):
         motion = relative(poses, first, second)
-        if np.linalg.norm(motion[:3, 3]) >= _STRIDE_M or _angle(motion) >= _STRIDE_RAD:
+        if np.linalg.norm(motion[:3, 3]) >= _STRIDE_M or angles_of(motion) >= _STRIDE_RAD:
             return second
     return last
 
@@ -290,60 +322,12 @@ def _thin(points: FloatArray, count: int) -> FloatArray:
     return points[:: max(1, len(points) // count)]
 
 
-def _angle(motion: Transform) -> float:
-    return float(np.arccos(np.clip((np.trace(motion[:3, :3]) - 1) / 2, -1.0, 1.0)))
-
-
-def _extent(motion: Transform) -> float:
-    """Return about how far, in metres, a motion moves a point that is 15 m away."""
-    return float(np.linalg.norm(motion[:3, 3]) + _LEVER_M * _angle(motion))
+def _extent(motions: FloatArray) -> FloatArray:
+    """Return about how far, in metres, (..., 4, 4) motions move a point that is 15 m away."""
+    return np.linalg.norm(motions[..., :3, 3], axis=-1) + _LEVER_M * angles_of(motions)
 
 
 def _transpose(poses: Poses) -> Poses:
     undone = poses.copy()
     undone[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
     return undone
-
-
-def _in_axes(stored_T_sensor: FloatArray) -> Callable[[Poses], Poses]:
-    """Return the correction of a change of axes: `stored_T_sensor` (3, 3) maps the axes of the
-    sensor to those of the stored poses.
-    """
-    change = np.eye(4)
-    change[:3, :3] = stored_T_sensor
-    return lambda poses: change.T @ poses @ change
-
-
-def _axes_mistakes() -> list[tuple[str, str, FloatArray]]:
-    """Return all 47 other choices of axes and their signs: (description, advice, matrix);
-    well-known ones first.
-    """
-    mirrored = np.diag([1.0, -1.0, 1.0])
-    # x right, y down, z forward, from x forward, y left, z up
-    camera_of_kitti = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
-    camera_advice = "convert them to the frame of the LiDAR: inv(Tr) @ P @ Tr, Tr from calib.txt"
-    camera = "camera-frame poses (x right, y down, z forward)"
-    mistakes = [
-        (
-            "poses with y mirrored against the scans",
-            "give scans and poses the same handedness: mirror y in both (S @ P @ S with S = "
-            "diag(1, -1, 1, 1)) or in neither",
-            mirrored,
-        ),
-        (camera, camera_advice, camera_of_kitti),
-        (camera, camera_advice, camera_of_kitti @ mirrored),
-        ("camera-frame poses with y mirrored", camera_advice, mirrored @ camera_of_kitti),
-        (
-            "camera-frame poses with y mirrored",
-            camera_advice,
-            mirrored @ camera_of_kitti @ mirrored,
-        ),
-    ]
-    known = [np.eye(3), *(matrix for _, _, matrix in mistakes)]
-    for names, matrix in choices_of_axes():
-        if not any(np.array_equal(matrix, other) for other in known):
-            is_camera = names[-1] == "x"
-            kind = "camera-frame poses" if is_camera else "poses in other axes than the scans"
-            advice = camera_advice if is_camera else "convert them to the axes of the scans"
-            mistakes.append((f"{kind} (x, y, z are {names})", advice, matrix))
-    return mistakes

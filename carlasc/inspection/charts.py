@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from carlasc.errors import ArgumentError, import_extra
+from carlasc.errors import ArgumentError, count, import_extra
 from carlasc.inspection.statistics import KINDS, Kind, Statistics
 from carlasc.storage.files import write_output
 
@@ -86,8 +86,7 @@ def draw_histograms(statistics: Statistics, plot: Path) -> None:
         axes.grid(axis="x", alpha=0.3)
     figure.axes[0].invert_yaxis()
     known = statistics.total.known_share
-    count = len(statistics.sequences)
-    title = "1 sequence" if count == 1 else f"{count} sequences"
+    title = count(len(statistics.sequences), "sequence")
     if len(splits) > 1:
         title += f" (darkest first: {', '.join(splits)})"
     figure.suptitle(title if np.isnan(known) else f"{title}, {known:.1%} of voxels known")

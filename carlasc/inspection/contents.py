@@ -188,11 +188,8 @@ def check_values(sequence: Sequence, frame: int) -> Iterator[Finding]:
             arrays[name] = sequence.read(name, frame)
     table = sequence.metadata.classes
     for name in sorted(layout.SCAN_FIELDS.keys() & arrays.keys()):
-        kind, where, array = (
-            layout.SCAN_FIELDS[name].kind,
-            _file(sequence, name, frame),
-            arrays[name],
-        )
+        kind, array = layout.SCAN_FIELDS[name].kind, arrays[name]
+        where = _file(sequence, name, frame)
         if array.dtype.kind == "f":
             yield from _check_numbers(name, array, where)
         elif kind == "class":
@@ -253,10 +250,9 @@ def _check_grid(
     if f"{grid}/counts" not in arrays:
         return
     counts, file = arrays[f"{grid}/counts"], _file(sequence, f"{grid}/counts", frame)
-    wrong = counts[~((counts >= 0) & (counts == np.floor(counts)) & np.isfinite(counts))]
-    if wrong.size:
-        found = f"{wrong[0]:g}, and {wrong.size - 1} other such values"
-        yield Finding("error", "counts", file, "whole numbers of votes, 0 or more", found)
+    right = (counts >= 0) & (counts == np.floor(counts)) & np.isfinite(counts)
+    for expected, found in _others(counts, right, "whole numbers of votes, 0 or more"):
+        yield Finding("error", "counts", file, expected, found)
     if without_vote := int(np.count_nonzero((labels != 0) & ~(counts > 0))):
         yield Finding(
             "error",
@@ -303,13 +299,10 @@ def _mistakes(
 ) -> Iterator[tuple[str, str]]:
     """Yield what was expected and what was found, for each kind of mistake."""
     if part == "occupied":
-        wrong = array[~((array >= 0) & (array <= 1))]  # NaN is wrong too
-        if wrong.size:
-            yield "probabilities of 0 to 1", f"{wrong[0]:g}, and {wrong.size - 1} other such values"
+        yield from _others(array, (array >= 0) & (array <= 1), "probabilities of 0 to 1")
     elif part == "flags":
-        wrong, most = array[array > sum(VoxelFlag)], sum(VoxelFlag)
-        if wrong.size:
-            yield f"flags of 0 to {most}", f"{wrong[0]}, and {wrong.size - 1} other such values"
+        most = sum(VoxelFlag)
+        yield from _others(array, array <= most, f"flags of 0 to {most}")
     elif part == "velocity":
         voxels, finite = array["voxel"].astype(np.int64), np.isfinite(array["velocity"]).all(axis=1)
         inside = (voxels >= 0) & (voxels < num_voxels)
@@ -319,15 +312,11 @@ def _mistakes(
             yield "finite velocities", f"NaN or infinity in {np.count_nonzero(~finite)} voxels"
     elif part == "classes":
         inside = (array["voxel"] >= 0) & (array["voxel"] < num_voxels)
-        wrong = array["voxel"][~inside]
-        if wrong.size:
-            found = f"{wrong[0]}, and {wrong.size - 1} other such rows"
-            yield f"voxels 0 to {num_voxels - 1}", found
+        yield from _others(array["voxel"], inside, f"voxels 0 to {num_voxels - 1}", "rows")
         if classes is not None:
-            wrong = array["label"][~np.isin(array["label"], sorted(set(classes.names) - {0}))]
-            if wrong.size:
-                found = f"{wrong[0]}, and {wrong.size - 1} other such rows"
-                yield f"class ids of {classes.name} other than 0", found
+            named = np.isin(array["label"], sorted(set(classes.names) - {0}))
+            expected = f"class ids of {classes.name} other than 0"
+            yield from _others(array["label"], named, expected, "rows")
         voxels, place = np.unique(array["voxel"][inside], return_inverse=True)
         sums, rows = np.bincount(place, array["votes"][inside], len(voxels)), np.bincount(place)
         # Each probability is rounded.
@@ -337,15 +326,25 @@ def _mistakes(
             yield f"probabilities that add up to at most {layout.CERTAIN} per voxel", others
 
 
+def _others(
+    values: AnyArray, right: AnyArray, expected: str, kind: str = "values"
+) -> Iterator[tuple[str, str]]:
+    """Yield what was expected, and the values that are not right if there are any; NaN is never
+    right.
+    """
+    wrong = values[~right]
+    if wrong.size:
+        first = format(wrong[0], "g" if wrong.dtype.kind == "f" else "d")
+        yield expected, f"{first}, and {wrong.size - 1} other such {kind}"
+
+
 def _check_classes(labels: AnyIntArray, classes: ClassTable, where: str) -> Iterator[Finding]:
     known = np.zeros(classes.num_channels, np.bool_)
     known[list(classes.names)] = True
     if (labels < len(known)).all() and known[labels].all():
         return
-    ids, counts = (array.tolist() for array in np.unique(labels, return_counts=True))
-    unknown = [
-        f"{i} ({n} times)" for i, n in zip(ids, counts, strict=True) if i not in classes.names
-    ]
+    numbers = zip(*np.unique(labels, return_counts=True), strict=True)
+    unknown = [f"{i} ({n} times)" for i, n in numbers if i not in classes.names]
     found = ", ".join(unknown[:5]) + (" and more" if len(unknown) > 5 else "")
     advice = f"correct the file, or the classes in {layout.METADATA}"
     yield Finding("error", "class-ids", where, f"class ids of {classes.name}", found, advice)
@@ -357,12 +356,7 @@ def _first_of(frames: set[int]) -> str:
 
 def _fields(sequence: Sequence, frame: int) -> list[str]:
     """Return the fields that a frame has."""
-    frames = {name: sequence.frames(name) for name in sequence.fields()}
-    return [
-        name
-        for name, numbers in frames.items()
-        if frame in numbers[np.searchsorted(numbers, frame) :][:1]
-    ]
+    return [name for name in sequence.fields() if frame in sequence.frames(name)]
 
 
 def _file(sequence: Sequence, field: str, frame: int) -> str:

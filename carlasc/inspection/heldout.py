@@ -5,7 +5,7 @@ are made from the other scans.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from functools import reduce
@@ -21,7 +21,12 @@ from carlasc.groundtruth import FrameFailure, FromScans, Voting
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
-from carlasc.groundtruth.from_scans.sequences import ScanSequence, scan_sequences
+from carlasc.groundtruth.from_scans.sequences import (
+    ScanFrame,
+    ScanSequence,
+    ScanWindow,
+    scan_sequences,
+)
 from carlasc.groundtruth.inputs import GridPlan
 from carlasc.inspection.heldout_scores import HeldOutScores
 from carlasc.motion.tracks import MovingActors
@@ -80,19 +85,6 @@ class HoldoutResult:
             "failures": [asdict(failure) for failure in self.failures],
             "elapsed_s": self.elapsed_s,
         }
-
-
-@dataclass(frozen=True)
-class _HeldOutFrame:
-    """One frame to measure. It pickles into a worker."""
-
-    path: str
-    feed: ScanFeed
-    actors: MovingActors
-    whole: Sequence
-    frame: int
-    plan: GridPlan
-    is_used: bool  # whether grids are made with these poses
 
 
 def holdout(
@@ -154,18 +146,17 @@ def holdout(
             drives.append(replace(drives[row], is_used=False))
             drives[row] = _HeldOutDrive.of(sequence, every)
     tasks = [task for drive in drives for task in drive.tasks(run, steps)]
+    measured = [(drive, frame) for drive in drives for frame in drive.frames]
     scores: dict[str, HeldOutScores] = {}
     before: dict[str, HeldOutScores] = {}
     failures = []
-    with closing(run_all(_run_task, tasks, run, lost=_fail)) as results:
-        for task, outcome in zip(tasks, results, strict=True):
-            totals = scores if task.is_used else before
+    with closing(run_all(_measure, tasks, run, lost=lambda _, message: message)) as results:
+        for (drive, frame), outcome in zip(measured, results, strict=True):
+            totals, path = scores if drive.is_used else before, drive.inputs.path
             if not isinstance(outcome, str):
-                totals[task.path] = (
-                    totals[task.path].merge(outcome) if task.path in totals else outcome
-                )
-            elif task.is_used:
-                failures.append(FrameFailure(task.whole.location, task.frame, outcome))
+                totals[path] = totals[path].merge(outcome) if path in totals else outcome
+            elif drive.is_used:
+                failures.append(FrameFailure(drive.inputs.location, frame, outcome))
             steps(1)
     for sequence in inputs:
         scores.setdefault(sequence.path, HeldOutScores.empty(sequence.metadata.classes))
@@ -206,59 +197,45 @@ class _HeldOutDrive:
         """Number of steps: scans that are read to find the actors, and frames."""
         return self.feed.reads_for_actors + len(self.frames)
 
-    def tasks(self, run: Run, steps: Callable[[int], None]) -> list[_HeldOutFrame]:
-        """Find the actors in the scans that are left; return a task for each frame to measure."""
-        feed, inputs = self.feed, self.inputs
+    def tasks(self, run: Run, steps: Callable[[int], None]) -> Iterator[_Task]:
+        """Find the actors in the scans that are left; yield a task for each frame to measure."""
         actors = MovingActors()
-        if feed.needs_actors:
-            actors = find_actors(feed, run, steps)
-        first, last = feed.options.window
-        path, whole, plan = inputs.path, inputs.feed.sequence, inputs.plan
-        return [
-            _HeldOutFrame(
-                path, feed, actors.between(f + first, f + last), whole, f, plan, self.is_used
-            )
-            for f in self.frames
-        ]
+        if self.feed.needs_actors:
+            actors = find_actors(self.feed, run, steps)
+        for frame in self.frames:
+            others = ScanFrame(ScanWindow(self.feed, actors), frame, frame)
+            yield others, self.inputs.feed.sequence, self.inputs.plan
 
 
-def _run_task(task: _HeldOutFrame) -> HeldOutScores | str:
+# a frame with the scans that make its grid, and the sequence that also has its own scan
+_Task = tuple[ScanFrame, Sequence, GridPlan]
+
+
+def _measure(task: _Task) -> HeldOutScores | str:
     """Measure one frame, in a worker; return why it failed if it did."""
+    others, whole, plan = task
+    feed, frame = others.inputs.feed, others.number
     try:
-        return _measure(task)
+        window = [other for other in feed.window_of(frame) if other != frame]
+        if not window:
+            raise MissingDataError(
+                f"{whole.location}: frame {frame}",
+                expected="other scans in its window",
+                found="none",
+                advice="leave out fewer scans, or choose another stride",
+            )
+        scan = whole.scan(frame, ("labels", "origins"))
+        origins = scan.others.get("origins", np.zeros_like(scan.points))
+        distance = np.linalg.norm((scan.points - origins).astype(np.float64), axis=1)
+        keep = (distance >= feed.min_range_m) & (distance <= feed.max_range_m)
+        if scan.labels is not None:
+            feed.classes.check(scan.labels, f"{whole.location}: labels of frame {frame}")
+            keep &= scan.labels > 0
+        reaching = feed.reaching(frame, plan.spec)
+        grid = merge_frame(plan, feed, others.inputs.actors, frame, reaching).grid
+        here = invert(feed.pose(frame))
+        poses = [here @ feed.pose(other) for other in window]
+        labels = None if scan.labels is None else scan.labels[keep]
+        return HeldOutScores.of(grid, feed.classes, scan.points[keep], labels, poses, origins[keep])
     except (CarlascError, OSError) as error:
         return str(error)
-
-
-def _fail(task: _HeldOutFrame, message: str) -> str:
-    """Return the result of a frame that no worker could measure."""
-    return message
-
-
-def _measure(task: _HeldOutFrame) -> HeldOutScores:
-    feed = task.feed
-    window = [other for other in feed.window_of(task.frame) if other != task.frame]
-    if not window:
-        raise MissingDataError(
-            f"{task.whole.location}: frame {task.frame}",
-            expected="other scans in its window",
-            found="none",
-            advice="leave out fewer scans, or choose another stride",
-        )
-    scan = task.whole.scan(task.frame, ("labels", "origins"))
-    origins = scan.others.get("origins")
-    distance = np.linalg.norm(
-        (scan.points if origins is None else scan.points - origins).astype(np.float64), axis=1
-    )
-    keep = (distance >= feed.min_range_m) & (distance <= feed.max_range_m)
-    if scan.labels is not None:
-        feed.classes.check(scan.labels, f"{task.whole.location}: labels of frame {task.frame}")
-        keep &= scan.labels > 0
-    grid = merge_frame(
-        task.plan, feed, task.actors, task.frame, feed.reaching(task.frame, task.plan.spec)
-    ).grid
-    here = invert(feed.pose(task.frame))
-    others = [here @ feed.pose(other) for other in window]
-    labels = None if scan.labels is None else scan.labels[keep]
-    origins = None if origins is None else origins[keep]
-    return HeldOutScores.of(grid, feed.classes, scan.points[keep], labels, others, origins)

@@ -5,7 +5,7 @@ distance, and shares of these.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -33,7 +33,6 @@ VEHICLE_M = ((-2.2, -0.75, -1.2), (2.2, 0.75, 0.0))
 sensor (x forward), metres.
 """
 
-_RETURNS, _FREE, _UNKNOWN, _PASSED, _PASSED_OBJECT, _MISSED = range(6)
 _SOLID, _OBJECT = 1, 2  # bits of a voxel: it is occupied; its class is not ground
 # histogram of the errors of the first hit; the last bin holds all larger ones
 _STEP_M, _STEPS = 0.02, 500
@@ -97,16 +96,13 @@ class HeldOutScores:
     swept_occupied: int = 0
 
     @classmethod
-    def empty(cls, classes: ClassTable, *, labelled: bool = True) -> HeldOutScores:
+    def empty(cls, classes: ClassTable) -> HeldOutScores:
         """Return the scores of no frame."""
-        shape = (classes.num_channels, len(BANDS_M) - 1)
-        return cls(
-            classes,
-            labelled,
-            0,
-            np.zeros((*shape, 6), np.int64),
-            np.zeros((*shape, _STEPS + 1), np.int64),
+        counts, errors = (
+            np.zeros((classes.num_channels, len(BANDS_M) - 1, columns), np.int64)
+            for columns in (6, _STEPS + 1)
         )
+        return cls(classes, True, 0, counts, errors)
 
     @classmethod
     def of(
@@ -135,50 +131,28 @@ class HeldOutScores:
             ArgumentError: the grid is cylindrical.
         """
         spec, occupied = grid.spec, grid.known & (grid.labels != 0)
-        ground = (
-            lowest_of_columns(occupied)
-            if labels is None
-            else np.isin(grid.labels, sorted(classes.ground))
-        )
+        if labels is None:
+            ground, kinds = lowest_of_columns(occupied), np.full(len(points), classes.geometry_id)
+        else:
+            ground, kinds = np.isin(grid.labels, sorted(classes.ground)), labels.astype(np.int64)
         solid = np.where(occupied, np.where(ground, _SOLID, _SOLID | _OBJECT), 0).astype(np.uint8)
-        at_points = labels_at(points, spec, grid.labels, grid.known)[0, 0]
+        at_points = labels_at(points, spec, grid.labels, grid.known)
         inside = (at_points != OUTSIDE) & np.any(points != 0, axis=1)
-        points, at_points = np.asarray(points[inside], np.float64), at_points[inside]
-        begun: FloatArray = (
-            np.zeros_like(points) if origins is None else np.asarray(origins[inside], np.float64)
-        )
-        kind = (
-            np.full(len(points), classes.geometry_id)
-            if labels is None
-            else labels[inside].astype(np.int64)
-        )
-        first, passed = _follow(solid, spec, begun, points)
-        ranges = np.linalg.norm(points - begun, axis=1)
+        begun = np.zeros_like(points) if origins is None else origins
+        ends, begun = points[inside].astype(np.float64), begun[inside].astype(np.float64)
+        first, passed = _follow(solid, spec, begun, ends)
+        ranges, at_points = np.linalg.norm(ends - begun, axis=1), at_points[inside]
         missed = np.isinf(first)
-        every = np.ones(len(points), np.bool_)
-        columns = (
-            every,
-            at_points == 0,
-            at_points == UNKNOWN,
-            passed != 0,
-            passed & _OBJECT != 0,
-            missed,
-        )
-        scores = cls.empty(classes, labelled=labels is not None)
-        band = np.searchsorted(BANDS_M, ranges, side="right") - 1
-        for column, chosen in enumerate(columns):
-            np.add.at(scores.counts[:, :, column], (kind[chosen], band[chosen]), 1)
-        step = np.minimum(np.abs(first - ranges)[~missed] / _STEP_M, _STEPS).astype(np.int64)
-        np.add.at(scores.errors, (kind[~missed], band[~missed], step), 1)
+        cells = kinds[inside], np.searchsorted(BANDS_M, ranges, side="right") - 1
+        free, unknown = at_points == 0, at_points == UNKNOWN
+        columns = (free | True, free, unknown, passed != 0, passed & _OBJECT != 0, missed)
+        scores = cls.empty(classes)
+        np.add.at(scores.counts, cells, np.column_stack(columns))
+        step = np.minimum(np.abs(first - ranges) / _STEP_M, _STEPS).astype(np.int64)
+        np.add.at(scores.errors, (*cells, step), ~missed)
         swept = swept_voxels(spec, grid_T_vehicles)
-        known_swept, hit_swept = int((swept & grid.known).sum()), int((swept & occupied).sum())
-        return replace(
-            scores,
-            frames=1,
-            swept_voxels=int(swept.sum()),
-            swept_known=known_swept,
-            swept_occupied=hit_swept,
-        )
+        figures = (int((swept & those).sum()) for those in (swept, grid.known, occupied))
+        return cls(classes, labels is not None, 1, scores.counts, scores.errors, *figures)
 
     def merge(self, other: HeldOutScores) -> HeldOutScores:
         """Return the scores of the frames of both, which have the same class table."""
@@ -199,7 +173,7 @@ class HeldOutScores:
     @property
     def all(self) -> RayShares:
         """All rays."""
-        return self._shares(self.counts.sum(axis=(0, 1)), self.errors.sum(axis=(0, 1)))
+        return self._shares(...)
 
     def by_class(self) -> dict[str, RayShares]:
         """Return the rays of each class that occurs, by its name; empty if the scans have no
@@ -208,21 +182,15 @@ class HeldOutScores:
         if not self.labelled:
             return {}
         return {
-            self.classes.names.get(i, str(i)): self._shares(
-                self.counts[i].sum(axis=0), self.errors[i].sum(axis=0)
-            )
+            self.classes.names.get(i, str(i)): self._shares(i)
             for i in np.flatnonzero(self.counts[:, :, 0].any(axis=1)).tolist()
         }
 
     def by_distance(self) -> dict[str, RayShares]:
         """Return the rays of each band of distances, by its name, such as "10-20 m"."""
-        shares = {}
-        for i, (low, high) in enumerate(pairwise(BANDS_M)):
-            name = f"{low:.0f}-{high:.0f} m" if np.isfinite(high) else f"{low:.0f} m and more"
-            shares[name] = self._shares(
-                self.counts[:, i].sum(axis=0), self.errors[:, i].sum(axis=0)
-            )
-        return shares
+        names = [f"{low:.0f}-{high:.0f} m" for low, high in pairwise(BANDS_M[:-1])]
+        names.append(f"{BANDS_M[-2]:.0f} m and more")
+        return {name: self._shares((slice(None), i)) for i, name in enumerate(names)}
 
     def to_dict(self) -> dict[str, Any]:
         """Return all figures as plain values for JSON."""
@@ -239,16 +207,18 @@ class HeldOutScores:
             },
         }
 
-    def _shares(self, counts: IntArray, errors: IntArray) -> RayShares:
-        total = int(counts[_RETURNS])
-        occupied = total - counts[_FREE] - counts[_UNKNOWN]
-        others = (counts[i] for i in (_PASSED, _PASSED_OBJECT, _MISSED))
-        free, unknown, hit, passed, passed_object, missed = (
-            float(part) / total if total else None
-            for part in (counts[_FREE], counts[_UNKNOWN], occupied, *others)
-        )
-        median, most = _quantile(errors, 0.5), _quantile(errors, 0.9)
-        return RayShares(total, free, unknown, hit, passed, passed_object, missed, median, most)
+    def _shares(self, chosen: Any) -> RayShares:
+        """Return the shares of the rays of some classes and bands, by an index of both."""
+        returns, free, unknown, *others = _summed(self.counts[chosen]).tolist()
+        counts = (free, unknown, returns - free - unknown, *others)
+        errors = _summed(self.errors[chosen])
+        shares = [part / returns if returns else None for part in counts]
+        shares += [_quantile(errors, 0.5), _quantile(errors, 0.9)]
+        return RayShares(returns, *shares)
+
+
+def _summed(counts: IntArray) -> IntArray:
+    return counts.reshape(-1, counts.shape[-1]).sum(axis=0)
 
 
 def swept_voxels(spec: GridSpec, grid_T_vehicles: Iterable[Transform]) -> BoolArray:
@@ -259,20 +229,15 @@ def swept_voxels(spec: GridSpec, grid_T_vehicles: Iterable[Transform]) -> BoolAr
         spec: geometry of the grid, Cartesian.
         grid_T_vehicles: (4, 4) poses of the vehicle's sensor in the frame of the grid, x forward.
     """
-    swept = np.zeros(spec.size, np.bool_)
-    lower, upper = np.array(VEHICLE_M)
-    corners = np.array(np.meshgrid(*zip(lower, upper, strict=True))).reshape(3, -1).T
+    centers, (lower, upper) = spec.centers(), np.array(VEHICLE_M)
+    axes = (centers[:, 0, 0, 0], centers[0, :, 0, 1], centers[0, 0, :, 2])
+    swept, reach_m = np.zeros(spec.size, np.bool_), np.linalg.norm(np.abs(VEHICLE_M).max(axis=0))
     for pose in grid_T_vehicles:
-        placed = (transform_points(pose, corners) - np.array(spec.lower)) / spec.voxel_size
-        first = np.clip(np.floor(placed.min(axis=0)).astype(int), 0, spec.size)
-        stop = np.clip(np.ceil(placed.max(axis=0)).astype(int), 0, spec.size)
-        cells = np.stack(np.meshgrid(*map(np.arange, first, stop), indexing="ij"), axis=-1).reshape(
-            -1, 3
+        near = np.ix_(
+            *(np.abs(axis - at) < reach_m for axis, at in zip(axes, pose[:3, 3], strict=True))
         )
-        centers = np.array(spec.lower) + (cells + 0.5) * spec.voxel_size
-        body = transform_points(invert(pose), centers)
-        i, j, k = cells[((body > lower) & (body < upper)).all(axis=1)].T
-        swept[i, j, k] = True
+        body = transform_points(invert(pose), centers[near])
+        swept[near] |= ((body > lower) & (body < upper)).all(axis=-1)
     return swept
 
 
@@ -296,10 +261,7 @@ def _quantile(errors: IntArray, share: float) -> float | None:
 
 
 def _follow(
-    solid: Uint8Array,
-    spec: GridSpec,
-    origins: AnyFloatArray,
-    points: AnyFloatArray,
+    solid: Uint8Array, spec: GridSpec, origins: FloatArray, points: FloatArray
 ) -> tuple[FloatArray, Uint8Array]:
     """Return what `follow_rays` returns, for (N, 3) rays that begin at (N, 3) origins, of which
     there are few different ones.
@@ -308,7 +270,5 @@ def _follow(
     first, passed = np.empty(len(points)), np.empty(len(points), np.uint8)
     for part, origin in runs_of_origins(origins[order], len(points)):
         rows = order[part]
-        first[rows], passed[rows] = follow_rays(
-            solid, spec, origin.astype(np.float64), points[rows]
-        )
+        first[rows], passed[rows] = follow_rays(solid, spec, origin, points[rows])
     return first, passed

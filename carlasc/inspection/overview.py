@@ -210,10 +210,8 @@ def _level(location: str, paths: list[str]) -> str:
 
 def _describe(sequence: Sequence) -> SequenceOverview:
     fields = {name: len(sequence.frames(name)) for name in sorted(sequence.fields())}
-    numbers = np.sort(
-        np.concatenate([np.empty(0, np.int64), *(sequence.frames(name) for name in fields)])
-    )
-    frames = numbers[np.diff(numbers, prepend=-1) > 0]  # np.unique would load numpy.ma
+    numbers = set[int]().union(*(sequence.frames(name).tolist() for name in fields))
+    frames = np.array(sorted(numbers), np.int64)
     metadata, problem = Metadata(), None
     grids: tuple[GridOverview, ...] = ()
     try:

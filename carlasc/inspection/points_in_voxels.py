@@ -15,7 +15,6 @@ from carlasc.core.grids import GridSpec
 
 UNKNOWN, OUTSIDE = -1, -2
 """What `labels_at` returns for points in unknown voxels, and for points outside of the grid."""
-_UNSHIFTED = np.zeros((1, 3), np.int64)
 
 
 def labels_at(
@@ -26,60 +25,66 @@ def labels_at(
     *,
     warps: FloatArray | None = None,
     later_s: float = 0.0,
-    shifts: IntArray = _UNSHIFTED,
+    shifts: IntArray | None = None,
 ) -> IntArray:
-    """Return the labels of the voxels of points, under corrections of the points and of the grid.
+    """Return the labels of the voxels of points, under corrections of the points or of the grid.
 
     Args:
         points: (N, 3) metres, in the frame of the grid.
         spec: geometry of the grid.
         labels: (X, Y, Z) class ids, or whether a voxel is occupied.
         known: (X, Y, Z) known voxels; None for all.
-        warps: (W, 3, 5) maps of points, p' = A p + b + c dt, as columns A, b, c; None for the
-            points as they are.
+        warps: (W, 3, 5) maps of points, p' = A p + b + c dt, as columns A, b, c.
         later_s: dt, seconds.
         shifts: (S, 3) cells by which the labels are too far along the axes. The azimuth of a full
             turn is periodic. A point whose shifted voxel is outside has that of no shift.
 
     Returns:
-        (W, S, N) class ids, 0 is free; `UNKNOWN` in unknown voxels, and `OUTSIDE`.
+        (N,) class ids, (W, N) with warps, or (S, N) with shifts. 0 is free; `UNKNOWN` in unknown
+        voxels, and `OUTSIDE`.
     """
-    values = labels.reshape(-1).astype(np.int64)
+    exact = points.astype(np.float64)
+    values = np.append(labels.astype(np.int64), OUTSIDE)
     if known is not None:
-        values[~known.reshape(-1)] = UNKNOWN
-    is_cylindrical = spec.coordinates == "cylindrical"
-    full_turn = is_cylindrical and spec.upper[1] - spec.lower[1] > 2 * math.pi - 1e-3
-    maps = np.eye(3, 5)[None] if warps is None else np.ascontiguousarray(warps)
-    at_points = np.empty((len(maps), len(shifts), len(points)), np.int64)
-    exact, moves, cells = points.astype(np.float64), warps is not None, Cells.of(spec)
-    _look_up(exact, moves, maps, later_s, shifts, cells, full_turn, values, at_points)
-    return at_points
+        values[:-1][~known.reshape(-1)] = UNKNOWN
+    if warps is None:
+        voxels = spec.flat_index(exact)
+        return values[voxels if shifts is None else _shifted(voxels, spec, shifts)]
+    return values[warped_voxels(exact, spec, warps, later_s)]
+
+
+def warped_voxels(
+    points: FloatArray, spec: GridSpec, warps: FloatArray, later_s: float = 0.0
+) -> IntArray:
+    """Return (W, N) voxels of points under maps, as in `labels_at`; outside, the number of voxels.
+
+    It is compiled, because many maps are tried on the same points.
+    """
+    voxels = np.empty((len(warps), len(points)), np.int64)
+    _find(points, np.ascontiguousarray(warps), later_s, Cells.of(spec), voxels)
+    return voxels
+
+
+def _shifted(voxels: IntArray, spec: GridSpec, shifts: IntArray) -> IntArray:
+    """Return (S, N) the voxels that are some cells away from (N,) voxels."""
+    cells = np.stack(np.unravel_index(np.maximum(voxels, 0), spec.size), axis=-1)
+    moved = cells + shifts[:, None]
+    if spec.coordinates == "cylindrical" and spec.upper[1] - spec.lower[1] > 2 * math.pi - 1e-3:
+        moved[..., 1] %= spec.size[1]
+    inside = (voxels >= 0) & ((moved >= 0) & (moved < spec.size)).all(axis=2)
+    flat = np.ravel_multi_index(tuple(np.moveaxis(moved, 2, 0)), spec.size, mode="clip")
+    return np.where(inside, flat, voxels)
 
 
 @cached
-def _look_up(  # type: ignore[no-untyped-def]
-    points, moves, maps, later_s, shifts, cells, full_turn, values, at_points
-):
-    depth, width, height = cells.size
+def _find(points, maps, later_s, cells, voxels):  # type: ignore[no-untyped-def]
     for w in range(len(maps)):
         m = maps[w]
         for i in range(len(points)):
             x, y, z = points[i, 0], points[i, 1], points[i, 2]
-            if moves:  # a map that changes nothing would make -0.0 of an azimuth of -pi to 0.0
-                x, y, z = (
-                    m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3] + m[0, 4] * later_s,
-                    m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3] + m[1, 4] * later_s,
-                    m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] + m[2, 4] * later_s,
-                )
-            voxel = find_voxel(x, y, z, cells)
-            if voxel == len(values):
-                at_points[w, :, i] = OUTSIDE
-                continue
-            for s in range(len(shifts)):
-                a = voxel // (width * height) + shifts[s, 0]
-                b = voxel // height % width + shifts[s, 1]
-                c = voxel % height + shifts[s, 2]
-                if full_turn:
-                    b %= width
-                inside = 0 <= a < depth and 0 <= b < width and 0 <= c < height
-                at_points[w, s, i] = values[(a * width + b) * height + c if inside else voxel]
+            voxels[w, i] = find_voxel(
+                m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3] + m[0, 4] * later_s,
+                m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3] + m[1, 4] * later_s,
+                m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] + m[2, 4] * later_s,
+                cells,
+            )

@@ -32,7 +32,6 @@ _RUN = 30  # scans of a run
 # frames by which poses are moved for another start, which must be better by this factor
 _SHIFTS, _BETTER = ((-2, 2), 0.9)
 _AGREE_M = 0.03  # scans that agree within this distance are aligned
-_LEVER_M = 15.0  # a turn counts by what it moves at this distance
 
 
 @dataclass(frozen=True)
@@ -107,7 +106,7 @@ def measure_poses(
     )
 
 
-def describe_mounting(mounting: Mounting, period_s: float) -> tuple[str, str] | None:
+def describe_mounting(mounting: Mounting) -> tuple[str, str] | None:
     """Return a description of poses with this mounting and an advice, for a message; None if they
     need no correction.
     """
@@ -137,10 +136,16 @@ def describe_mounting(mounting: Mounting, period_s: float) -> tuple[str, str] | 
         when, late_s = "late" if values[6] > 0 else "early", abs(values[6])
         described.append(
             f"poses that are {late_s:.2f} ± {errors[6]:.2f} s {when} "
-            f"({late_s / period_s:.1f} frames)"
+            f"({late_s / layout.FRAME_PERIOD_S:.1f} frames)"
         )
         advice += ", and compare the time stamps of both"
     return (" and ".join(described), advice) if described else None
+
+
+def angles_of(motions: FloatArray) -> FloatArray:
+    """Return (...) the angles by which (..., 4, 4) motions turn, radians."""
+    traces = np.trace(motions[..., :3, :3], axis1=-2, axis2=-1)
+    return np.asarray(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
 
 
 def _choose_runs(poses: FloatArray, seconds: FloatArray) -> list[int]:
@@ -151,13 +156,10 @@ def _choose_runs(poses: FloatArray, seconds: FloatArray) -> list[int]:
     if count <= _RUN:
         return [0] if count > 2 else []
     motions = multiply(invert(poses[:-1]), poses[1:])
-    cosine = np.clip((motions[:, 0, 0] + motions[:, 1, 1] + motions[:, 2, 2] - 1) / 2, -1, 1)
-    speed = np.sqrt(np.square(motions[:, :3, 3]).sum(axis=1)) / np.maximum(np.diff(seconds), 1e-3)
-    changes = (
-        np.abs(speed[_RUN // 3 :] - speed[: -(_RUN // 3)]) if count > _RUN // 3 + 1 else np.zeros(1)
-    )
+    speed = np.linalg.norm(motions[:, :3, 3], axis=1) / np.maximum(np.diff(seconds), 1e-3)
+    changes = np.abs(speed[_RUN // 3 :] - speed[: -(_RUN // 3)])
     chosen: list[int] = []
-    for values in (_LEVER_M * np.arccos(cosine), changes, -np.abs(np.arange(count) - count / 2)):
+    for values in (angles_of(motions), changes, -np.abs(np.arange(count) - count / 2)):
         sums = np.convolve(values, np.ones(min(_RUN, len(values))), "valid")
         for row in np.argsort(-sums, kind="stable")[:: max(1, len(sums) // 50)].tolist():
             first = min(row, count - _RUN)
@@ -285,10 +287,8 @@ def _check_steps(sequence: Sequence, frames: IntArray, where: str) -> Iterator[F
         period_s = np.zeros(1)
     if not (period_s > 0).all():  # which is reported elsewhere
         period_s = np.diff(frames) * layout.FRAME_PERIOD_S
-    moved_m = np.linalg.norm(steps[:, :3, 3], axis=1)
-    cosine = (np.trace(steps[:, :3, :3], axis1=1, axis2=2) - 1) / 2
-    speed, turned = moved_m / period_s, np.arccos(np.clip(cosine, -1, 1))
-    turn = turned / period_s
+    moved_m, turned = np.linalg.norm(steps[:, :3, 3], axis=1), angles_of(steps)
+    speed, turn = moved_m / period_s, turned / period_s
     usual = np.array([np.median(speed[max(0, i - 3) : i + 4]) for i in range(len(speed))])
     strange = np.abs(speed - usual)
     jumps = np.flatnonzero(

@@ -45,37 +45,33 @@ def write_report_page(result: ReportResult, out: str | Path) -> None:
 
 def describe(report: Report) -> list[tuple[str, str]]:
     """Return the content of a report, as pairs of a name and a text."""
-    coverage, convergence, actors = report.coverage, report.convergence, report.actors
-    frames = report.frames
+    coverage, convergence, frames = report.coverage, report.convergence, report.frames
     span = f" ({frames[0]} to {frames[-1]})" if frames else ""
-    rows = [
-        ("frames", f"{len(frames)}{span}"),
-        ("known", f"{coverage.known_share:.1%} of the voxels"),
-        ("occupied", f"{coverage.occupied_share:.1%} of the known voxels"),
-    ]
+    rows = {
+        "frames": f"{len(frames)}{span}",
+        "known": f"{coverage.known_share:.1%} of the voxels",
+        "occupied": f"{coverage.occupied_share:.1%} of the known voxels",
+    }
     if coverage.mean_votes is not None:
-        rows.append(("votes", f"{coverage.mean_votes:.1f} per known voxel, on average"))
+        rows["votes"] = f"{coverage.mean_votes:.1f} per known voxel, on average"
     if convergence is not None:
-        changed = (
+        rows["convergence"] = (
             f"{convergence.changed_share:.2%} of the known voxels change their label if "
-            f"{LEFT_OUT:.0%} of the scans are left out"
+            f"{LEFT_OUT:.0%} of the scans are left out ({count(convergence.frames, 'frame')})"
         )
-        rows.append(("convergence", f"{changed} ({count(convergence.frames, 'frame')})"))
-    if actors is not None:
-        rows.append(("actors", _count(actors)))
+    if report.actors is not None:
+        rows["actors"] = _count(report.actors)
     if report.poses is not None:
-        rows.append(("poses", _poses(report.poses)))
+        rows["poses"] = _poses(report.poses)
     if report.inferred_share is not None:
-        rows.append(("inferred", f"{report.inferred_share:.1%} of the known voxels"))
+        rows["inferred"] = f"{report.inferred_share:.1%} of the known voxels"
     if report.holdout is not None:
-        rows.append(("held-out rays", _held_out(report.holdout)))
+        rows["held-out rays"] = _held_out(report.holdout)
     settings = report.settings.get(RECORD)
     if isinstance(settings, dict):
-        rows.append(("settings", ", ".join(f"{name} {value}" for name, value in settings.items())))
-    rows.append(
-        ("versions", ", ".join(f"{name} {value}" for name, value in report.versions.items()))
-    )
-    return rows
+        rows["settings"] = ", ".join(f"{name} {value}" for name, value in settings.items())
+    rows["versions"] = ", ".join(f"{name} {value}" for name, value in report.versions.items())
+    return [*rows.items()]
 
 
 def _count(actors: Sequence[ActorTrack]) -> str:
@@ -130,30 +126,26 @@ def _section(name: str, report: Report) -> str:
         key=lambda pair: -pair[1],
     )
     votes = [(_bin_name(power), count / known) for power, count in enumerate(coverage.votes)]
-    spec, held_out, actors = (
-        GridSpec.from_params(report.settings, name),
-        report.holdout,
-        report.actors,
-    )
-    digests = [[field, digest.all] for field, digest in report.digests.items()]
-    digests += [[field, digest.digest] for field, digest in report.documents.items()]
+    spec, frames = GridSpec.from_params(report.settings, name), report.frames
+    digests = {field: digest.all for field, digest in report.digests.items()}
+    digests |= {field: digest.digest for field, digest in report.documents.items()}
+    held_out, actors = "", ""
+    if report.holdout and report.holdout["by_distance"]:
+        held_out = _part("Held-out rays", _held_out_table(report.holdout))
+    if report.actors:
+        content = f"{_timeline(report.actors, frames)}\n{_actor_table(report.actors)}"
+        actors = _part("Moving actors by frame", content)
     return fill(
         "report-grid.html",
         name=escape(name),
         coordinates=spec.coordinates,
         size=" x ".join(map(str, spec.size)),
-        figures=_table([], [[label, text] for label, text in describe(report)]),
+        figures=_table([], describe(report)),
         classes=_bars(classes),
         votes=_part("Known voxels by their number of votes", _bars(votes)) if votes else "",
-        held_out=_part("Held-out rays", _held_out_table(held_out))
-        if held_out and held_out["by_distance"]
-        else "",
-        actors=_part(
-            "Moving actors by frame", f"{_timeline(actors, report.frames)}\n{_actor_table(actors)}"
-        )
-        if actors
-        else "",
-        digests=_table(["file", "digest"], digests),
+        held_out=held_out,
+        actors=actors,
+        digests=_table(["file", "digest"], digests.items()),
     )
 
 
@@ -162,11 +154,11 @@ def _part(title: str, content: str) -> str:
 
 
 def _table(
-    header: Sequence[str], rows: Iterable[Sequence[object]], *, figures: bool = False
+    header: Iterable[str], rows: Iterable[Iterable[object]], *, figures: bool = False
 ) -> str:
     """Return a table; with `figures`, all columns except the first hold numbers."""
 
-    def line(cells: Sequence[object], tag: str) -> str:
+    def line(cells: Iterable[object], tag: str) -> str:
         parts = []
         for column, cell in enumerate(cells):
             kind = ' class="n"' if figures and column else ""
@@ -181,11 +173,19 @@ def _bars(rows: Sequence[tuple[str, float]]) -> str:
     """Return horizontal bars of shares; a square-root scale shows small shares, too."""
     lines = []
     for row, (label, share) in enumerate(rows):
-        y, width = row * _ROW, 520 * share**0.5
-        lines.append(f'<text x="0" y="{y + 13}">{escape(label)}</text>')
-        lines.append(f'<rect x="130" y="{y + 3}" width="{width:.1f}" height="12" fill="{_BAR}"/>')
-        lines.append(f'<text x="{136 + width:.1f}" y="{y + 13}">{share:.2%}</text>')
+        width = 520 * share**0.5
+        lines += _bar(row, label, 130, width)
+        lines.append(f'<text x="{136 + width:.1f}" y="{row * _ROW + 13}">{share:.2%}</text>')
     return _svg(720, len(rows) * _ROW, lines)
+
+
+def _bar(row: int, label: str, x: float, width: float, more: str = "") -> list[str]:
+    y = row * _ROW
+    place = f'x="{x:.1f}" y="{y + 3}" width="{width:.1f}" height="12"'
+    return [
+        f'<text x="0" y="{y + 13}">{escape(label)}</text>',
+        f'<rect {place} fill="{_BAR}"{more}/>',
+    ]
 
 
 def _timeline(actors: Sequence[ActorTrack], frames: Sequence[int]) -> str:
@@ -197,15 +197,10 @@ def _timeline(actors: Sequence[ActorTrack], frames: Sequence[int]) -> str:
     scale = 560 / max(last - first, 1)
     lines = []
     for row, actor in enumerate(actors):
-        y, x = row * _ROW, 130 + (actor.first - first) * scale
-        width = max((actor.last - actor.first) * scale, 2)
-        name = f"{actor.label} {actor.instance or ''}".strip()
-        lines.append(f'<text x="0" y="{y + 13}">{escape(name)}</text>')
-        share = actor.observations / (actor.last - actor.first + 1)
-        lines.append(
-            f'<rect x="{x:.1f}" y="{y + 3}" width="{width:.1f}" height="12" fill="{_BAR}" '
-            f'fill-opacity="{share:.2f}"/>'
-        )
+        name, length = f"{actor.label} {actor.instance or ''}".strip(), actor.last - actor.first
+        opacity = f' fill-opacity="{actor.observations / (length + 1):.2f}"'
+        x, width = 130 + (actor.first - first) * scale, max(length * scale, 2)
+        lines += _bar(row, name, x, width, opacity)
     axis = len(actors) * _ROW + 14
     lines += [f'<text x="130" y="{axis}">{first}</text>', f'<text x="680" y="{axis}">{last}</text>']
     return _svg(720, axis + 6, lines)
@@ -217,57 +212,40 @@ def _svg(width: int, height: int, lines: Sequence[str]) -> str:
 
 
 def _actor_table(actors: Sequence[ActorTrack]) -> str:
-    header = [
-        "class",
-        "instance",
-        "first",
-        "last",
-        "observations",
-        "points",
-        "m/s",
-        "size, m",
-        "residual, m",
-        "static, m",
-        "sure",
-    ]
     rows = [
-        [
-            actor.label,
-            actor.instance or None,
-            actor.first,
-            actor.last,
-            actor.observations,
-            actor.points,
-            f"{actor.speed_m_s:.1f}",
-            " x ".join(f"{side:.1f}" for side in actor.size_m),
-            _metres(actor.residual_m),
-            _metres(actor.residual_static_m),
-            f"{actor.confidence:.0%}",
-        ]
+        {
+            "class": actor.label,
+            "instance": actor.instance or None,
+            "first": actor.first,
+            "last": actor.last,
+            "observations": actor.observations,
+            "points": actor.points,
+            "m/s": f"{actor.speed_m_s:.1f}",
+            "size, m": " x ".join(f"{side:.1f}" for side in actor.size_m),
+            "residual, m": _metres(actor.residual_m),
+            "static, m": _metres(actor.residual_static_m),
+            "sure": f"{actor.confidence:.0%}",
+        }
         for actor in actors
     ]
-    table = _table(header, rows, figures=True)
+    table = _table(rows[0], [row.values() for row in rows], figures=True)
     return f"<details><summary>Table of the actors</summary>{table}</details>"
 
 
 def _held_out_table(values: Mapping[str, Any]) -> str:
     shares = ("free", "unknown", "occupied", "passed", "passed_object", "missed")
-    header = ["rays", "returns", *(name.replace("_", " ") for name in shares), "error, m", "90%, m"]
-    rows = [
-        [
-            label,
-            rays["returns"],
-            *("" if rays[name] is None else f"{rays[name]:.2%}" for name in shares),
-            _metres(rays["error_median_m"]),
-            _metres(rays["error_90_m"]),
-        ]
-        for label, rays in {
-            "all": values["rays"],
-            **values["by_distance"],
-            **values["by_class"],
-        }.items()
-    ]
-    return _table(header, rows, figures=True)
+    rows = []
+    for label, rays in {
+        "all": values["rays"],
+        **values["by_distance"],
+        **values["by_class"],
+    }.items():
+        row = {"rays": label, "returns": rays["returns"]}
+        for name in shares:
+            row[name.replace("_", " ")] = None if rays[name] is None else f"{rays[name]:.2%}"
+        row |= {"error, m": _metres(rays["error_median_m"]), "90%, m": _metres(rays["error_90_m"])}
+        rows.append(row)
+    return _table(rows[0], [row.values() for row in rows], figures=True)
 
 
 def _metres(value: float | None) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
@@ -10,14 +10,13 @@ from typing import Any
 from carlasc.core.frames import FrameRange
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, MissingDataError
 from carlasc.groundtruth import FrameFailure, FromScans, Voting
-from carlasc.groundtruth.from_scans.motion_pass import find_actors
-from carlasc.groundtruth.from_scans.sequences import ScanFrame, ScanSequence
-from carlasc.groundtruth.inputs import GridPlan, without_caches
+from carlasc.groundtruth.from_scans.sequences import ScanSequence
+from carlasc.groundtruth.inputs import FrameInput, GridPlan, without_caches
 from carlasc.groundtruth.reporting import Changes, FrameFacts, Report, sample_frames
 from carlasc.inspection.heldout import EVERY
 from carlasc.inspection.heldout import holdout as leave_out
 from carlasc.motion.options import MotionOptions, PoseOptions
-from carlasc.running.processes import run_all
+from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath, write_output
@@ -101,25 +100,22 @@ def report(
         for _, sequence, name in grids:
             _check_writable(sequence, name)
     makers = [_ReportMaker(sequence, name) for _, sequence, name in grids]
-    reports: dict[int, Report] = {}
-    for row, (_, sequence, name) in enumerate([] if remake else grids):
-        if (existing := report_beside(sequence, name)) is not None:
-            reports[row] = existing
-    missing = [row for row in range(len(makers)) if row not in reports]
-    measured = _measure_all([makers[row] for row in missing], run)
+    existing = [None if remake else report_beside(sequence, name) for _, sequence, name in grids]
+    total = sum(maker.steps for maker, one in zip(makers, existing, strict=True) if one is None)
+    steps = StepCounter(run.progress, total)
+    steps(0)
     failures: list[FrameFailure] = []
-    for row, results in zip(missing, measured, strict=True):
-        failures += [result for result in results if isinstance(result, FrameFailure)]
-        reports[row] = makers[row].make(results)
-    by_grid: dict[str, Report] = {}
-    for row, (path, sequence, name) in enumerate(grids):
-        one = reports[row]
-        if holdout and one.holdout is None:
-            one = replace(one, holdout=makers[row].held_out(run))
-        if save and isinstance(sequence, FolderSequence):
-            write_output(sequence.folder / layout.report_file(name), one.to_json())
-        by_grid[f"{path}/{name}" if path else name] = one
-    return ReportResult(opened.location, by_grid, tuple(failures))
+    reports: dict[str, Report] = {}
+    with one_pool(run) as spread:
+        for (path, sequence, name), maker, found in zip(grids, makers, existing, strict=True):
+            one, failed = (found, []) if found else maker.make(spread, steps)
+            failures += failed
+            if holdout and one.holdout is None:
+                one = replace(one, holdout=maker.held_out(spread))
+            if save and isinstance(sequence, FolderSequence):
+                write_output(sequence.folder / layout.report_file(name), one.to_json())
+            reports[f"{path}/{name}" if path else name] = one
+    return ReportResult(opened.location, reports, tuple(failures))
 
 
 def report_beside(sequence: Sequence, grid: str) -> Report | None:
@@ -134,27 +130,6 @@ def report_beside(sequence: Sequence, grid: str) -> Report | None:
     return Report.from_json(sequence.read_document(name), f"{sequence.location}/{name}")
 
 
-_Measured = FrameFacts | FrameFailure
-
-
-def _measure_all(makers: list[_ReportMaker], run: Run) -> list[list[_Measured]]:
-    """Return the measurements of the frames of each report."""
-    steps = StepCounter(
-        run.progress, sum(len(maker.frames) + maker.steps_before for maker in makers)
-    )
-    steps(0)
-    for maker in makers:
-        maker.find_actors(run, steps)
-    tasks = [(row, task) for row, maker in enumerate(makers) for task in maker.tasks()]
-    measured: list[list[_Measured]] = [[] for _ in makers]
-    frames = [task for _, task in tasks]
-    with closing(run_all(_measure, frames, run, lost=_fail)) as results:
-        for (row, _), result in zip(tasks, results, strict=True):
-            measured[row].append(result)
-            steps(1)
-    return measured
-
-
 @dataclass(frozen=True)
 class _ReportedFrame:
     """One frame to measure. It pickles into a worker."""
@@ -162,7 +137,7 @@ class _ReportedFrame:
     sequence: Sequence
     grid: str
     number: int
-    scans: ScanFrame | None  # the scans that it was made from
+    scans: FrameInput | None  # the scans that it was made from
     plan: GridPlan | None  # to make the grid again without a tenth of the scans
 
 
@@ -175,53 +150,42 @@ class _ReportMaker:
         self.inputs = _inputs_of(sequence, grid)
 
     @property
-    def steps_before(self) -> int:
-        """Number of scans of the passes that refine poses and find the actors."""
-        return 0 if self.inputs is None else self.inputs.steps_before
+    def steps(self) -> int:
+        """Number of frames, and of scans of the passes that refine poses and find the actors."""
+        return len(self.frames) + (0 if self.inputs is None else self.inputs.steps_before)
 
-    def find_actors(self, run: Run, steps: Callable[[int], None]) -> None:
-        """Refine poses and find the actors, if the grid was made so.
-
-        If a scan cannot be read, the grid is not made again.
-        """
-        if self.inputs is None:
-            return
+    def make(self, run: Run, steps: StepCounter) -> tuple[Report, list[FrameFailure]]:
+        """Measure the frames, and make the report; return also the frames that cannot be read."""
+        sequence, inputs = self.sequence, self.inputs
         try:
-            self.inputs.refine(None, run, steps)
-            if self.inputs.feed.needs_actors:
-                self.inputs.actors = find_actors(self.inputs.feed, run, steps)
+            if inputs is not None:
+                inputs.prepare(None, run, steps)
         except (CarlascError, OSError):  # the error is reported when the frame is measured
-            self.inputs = None
-
-    def tasks(self) -> list[_ReportedFrame]:
-        """Return the frames to measure."""
-        light, sampled = without_caches(self.sequence), sample_frames(self.frames)
-        scans = set() if self.inputs is None else set(self.inputs.feed.frames.tolist())
-        return [
-            _ReportedFrame(
-                light,
-                self.grid,
-                number,
-                ScanFrame(self.inputs, number, number)
-                if self.inputs is not None and number in scans
-                else None,
-                None if self.inputs is None or number not in sampled else self.inputs.plan,
-            )
-            for number in self.frames
-        ]
-
-    def make(self, measured: list[_Measured]) -> Report:
-        """Make the report from the measurements."""
-        sequence = self.sequence
+            self.inputs = inputs = None
+        facts, failures = list[FrameFacts](), list[FrameFailure]()
+        with closing(run_all(_measure, self._tasks(), run, lost=_fail)) as results:
+            for result in results:
+                if isinstance(result, FrameFacts):
+                    facts.append(result)
+                else:
+                    failures.append(result)
+                steps(1)
         names = (layout.POSES, layout.TIMES, layout.METADATA, layout.params_file(self.grid))
         documents = {
             name: sequence.read_document(name) for name in names if name in sequence.documents()
         }
         classes, params = sequence.classes_of(self.grid), sequence.params(self.grid)
-        facts = [result for result in measured if isinstance(result, FrameFacts)]
-        actors = None if self.inputs is None else self.inputs.summaries()
-        poses = None if self.inputs is None else self.inputs.pose_facts()
-        return Report.make(self.grid, facts, params, classes, documents, actors=actors, poses=poses)
+        actors = None if inputs is None else inputs.summaries()
+        poses = None if inputs is None else inputs.pose_facts()
+        made = Report.make(self.grid, facts, params, classes, documents, actors=actors, poses=poses)
+        return made, failures
+
+    def _tasks(self) -> Iterator[_ReportedFrame]:
+        light, sampled = without_caches(self.sequence), sample_frames(self.frames)
+        for number in self.frames:
+            scans = None if self.inputs is None else self.inputs.frame(number)
+            plan = self.inputs.plan if self.inputs is not None and number in sampled else None
+            yield _ReportedFrame(light, self.grid, number, scans, plan)
 
     def held_out(self, run: Run) -> Mapping[str, Any] | None:
         """Measure held-out scores; None if the grid is cylindrical, or was not made from the scans
@@ -300,9 +264,12 @@ def _measure(task: _ReportedFrame) -> FrameFacts | FrameFailure:
             if n in present and number in sequence.frames(n)
         }
         spec, classes, changes = sequence.grids[grid], sequence.classes_of(grid), None
-        if task.scans is not None and task.plan is not None:
-            changes = Changes.between(sequence.grid(grid, number), task.scans.thinned(task.plan))
         residuals = None if task.scans is None else task.scans.residuals()
+        thinned = None
+        if task.scans is not None and task.plan is not None:
+            thinned = task.scans.thinned(task.plan)
+        if thinned is not None:
+            changes = Changes.between(sequence.grid(grid, number), thinned)
         return FrameFacts.of(number, arrays, grid, spec, classes, changes, residuals)
     except (CarlascError, OSError) as error:
         return FrameFailure(sequence.location, number, str(error))

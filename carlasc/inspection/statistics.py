@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
@@ -27,9 +27,8 @@ if TYPE_CHECKING:
 Kind = Literal["points", "voxels"]
 KINDS: tuple[Kind, ...] = ("points", "voxels")
 _COUNT_APART = "count the sequences of each table separately"
+_COUNTED = ("scans", "grids", "actor_voxels", "moving_voxels")
 _CHUNK = 32  # frames per task of a worker
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -164,10 +163,7 @@ class Statistics:
                 figures |= {f"{kind}_remapped": self.summed(histogram.of(kind)) for kind in KINDS}
             return figures | {
                 "unknown_voxels": histogram.unknown,
-                "scans": histogram.scans,
-                "grids": histogram.grids,
-                "actor_voxels": histogram.actor_voxels,
-                "moving_voxels": histogram.moving_voxels,
+                **{name: getattr(histogram, name) for name in _COUNTED},
                 "known_share": None if np.isnan(share) else share,
             }
 
@@ -222,8 +218,12 @@ def stats(
     step = StepCounter(run.progress, sum(len(frames) for _, _, frames in tasks))
     histograms = {path: Histogram.empty(classes) for path in sequences}
     failures: list[tuple[str, str]] = []
-    count, lost = partial(_count, classes=classes), partial(_fail, classes=classes)
-    counted = run_all(count, tasks, run, lost=lost)
+    counted = run_all(
+        partial(_count, classes=classes),
+        tasks,
+        run,
+        lost=lambda task, message: (Histogram.empty(classes), _failures(task, message)),
+    )
     for (sequence, _, frames), (histogram, failed) in zip(tasks, counted, strict=True):
         histograms[sequence.path] += histogram
         failures += failed
@@ -251,33 +251,26 @@ def _tasks(sequence: Sequence, grid: str, every: int) -> list[_Task]:
 
 def _count(task: _Task, classes: ClassTable) -> tuple[Histogram, list[tuple[str, str]]]:
     """Count the classes of some frames; runs in a worker."""
-    sequence, field, frames = task
     histogram, failures = Histogram.empty(classes), []
-    for frame in frames:
+    for frame in task[2]:
         try:
-            histogram += _count_frame(sequence, field, frame, classes)
+            histogram += _count_frame(*task[:2], frame, classes)
         except CarlascError as error:
-            failures.append((f"{sequence.path} {field} {frame:06d}", str(error)))
+            failures += _failures((*task[:2], (frame,)), str(error))
     return histogram, failures
 
 
-def _fail(
-    task: _Task, message: str, classes: ClassTable
-) -> tuple[Histogram, list[tuple[str, str]]]:
-    """Return the result of frames whose workers failed."""
+def _failures(task: _Task, message: str) -> list[tuple[str, str]]:
     sequence, field, frames = task
-    return Histogram.empty(classes), [
-        (f"{sequence.path} {field} {frame:06d}", message) for frame in frames
-    ]
+    return [(f"{sequence.path} {field} {frame:06d}", message) for frame in frames]
 
 
 def _count_frame(sequence: Sequence, field: str, frame: int, classes: ClassTable) -> Histogram:
     where, stored = f"{sequence.location}: {field} of frame {frame}", _table_of(sequence, field)
     labels = sequence.read(field, frame)
     stored.check(labels, where)
-    labels = to_table(labels, stored, classes, where)
+    labels, unknown = to_table(labels, stored, classes, where).reshape(-1), 0
     histogram, grid = Histogram.empty(classes), field.removesuffix("labels")
-    labels, unknown = labels.reshape(-1), 0
     if not grid:
         points = np.bincount(labels, minlength=classes.num_channels)
         return replace(histogram, points=points, scans=1)

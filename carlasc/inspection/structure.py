@@ -12,9 +12,10 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray, AnyFloatArray, BoolArray, FloatArray
 from carlasc.core.classes import ClassTable
-from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform
+from carlasc.core.grids import GridSpec
 from carlasc.errors import CarlascError
+from carlasc.inspection.points_in_voxels import warped_voxels
 from carlasc.storage.protocol import Sequence
 
 MIN_RANGE_M = 3.0
@@ -25,7 +26,12 @@ _FOOT_M = 0.3  # lowest part of an upright column, which counts as ground
 VOXEL_M = 0.4
 """Size of the cells."""
 
-_CELLS = int(2 * MAX_RANGE_M / VOXEL_M)
+_SPACE = GridSpec(
+    "cartesian",
+    (int(2 * MAX_RANGE_M / VOXEL_M),) * 3,
+    (-MAX_RANGE_M,) * 3,
+    (MAX_RANGE_M,) * 3,
+)
 
 
 def static_structure(sequence: Sequence, frame: int) -> FloatArray:
@@ -65,7 +71,7 @@ def structure_of(
     Returns:
         (M, 3) float64 points, metres, in the frame of the sensor.
     """
-    keep = within(points, points.dtype.type(MIN_RANGE_M), points.dtype.type(MAX_RANGE_M))
+    keep = within(points, MIN_RANGE_M, MAX_RANGE_M)
     if labels is not None and bool(labels.any()):
         keep &= _static_classes(classes)[
             # packed stores keep labels in uint8
@@ -74,21 +80,19 @@ def structure_of(
     else:
         keep[keep] = _is_upright(points[keep])
     if flow is not None:
-        keep &= _rows(np.abs(flow) < 0.1)
+        keep &= (np.abs(flow) < 0.1).all(axis=1)
     return points[np.flatnonzero(keep)].astype(np.float64)
 
 
-@cached(error_model="python")
 def within(points: AnyFloatArray, nearest: float, farthest: float) -> BoolArray:
     """Return (N,) which of (N, 3) points are between two distances from the sensor.
 
     Points that are not finite are not.
     """
-    is_within = np.empty(len(points), np.bool_)
-    for i in range(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        is_within[i] = nearest < np.sqrt(x * x + y * y + z * z) < farthest
-    return is_within
+    x, y, z = points.T
+    with np.errstate(invalid="ignore"):
+        distance = np.sqrt(x * x + y * y + z * z)
+    return np.asarray((distance > nearest) & (distance < farthest))
 
 
 def _per_point(sequence: Sequence, field: str, frame: int, count: int) -> AnyArray | None:
@@ -102,13 +106,6 @@ def _per_point(sequence: Sequence, field: str, frame: int, count: int) -> AnyArr
     except CarlascError:
         return None
     return array if len(array) == count else None
-
-
-def _rows(mask: BoolArray) -> BoolArray:
-    """Return which rows of an (N, 3) mask are all true: `mask.all(axis=1)` in a seventh of its
-    time.
-    """
-    return mask[:, 0] & mask[:, 1] & mask[:, 2]
 
 
 def _static_classes(table: ClassTable) -> BoolArray:
@@ -138,8 +135,9 @@ def _is_upright(points: AnyFloatArray) -> BoolArray:
 
 def occupancy(points: FloatArray) -> BoolArray:
     """Return the (C, C, C) cells about the sensor that hold points, (N, 3) metres, sensor frame."""
-    occupied = np.zeros((_CELLS, _CELLS, _CELLS), np.bool_)
-    occupy(occupied, points, MAX_RANGE_M, VOXEL_M)
+    occupied = np.zeros(_SPACE.size, np.bool_)
+    cells, inside = _SPACE.index(points)
+    occupied[tuple(cells[inside].T)] = True
     return occupied
 
 
@@ -151,43 +149,5 @@ def overlap(occupied: BoolArray, motion: Transform, points: FloatArray) -> float
         motion: (4, 4) other_T_scan.
         points: (N, 3) metres, N > 0.
     """
-    return count_occupied(occupied, motion, points, MAX_RANGE_M, VOXEL_M) / len(points)
-
-
-@cached(error_model="python")
-def occupy(occupied: BoolArray, points: FloatArray, reach_m: float, voxel_m: float) -> None:
-    """Mark the cells of a grid that hold points; the arguments are those of `count_occupied`."""
-    cells = len(occupied)
-    for i in range(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        a, b, c = (x + reach_m) / voxel_m, (y + reach_m) / voxel_m, (z + reach_m) / voxel_m
-        if 0 <= a < cells and 0 <= b < cells and 0 <= c < cells:
-            occupied[int(a), int(b), int(c)] = True
-
-
-@cached(error_model="python")
-def count_occupied(
-    occupied: BoolArray,
-    motion: FloatArray,
-    points: FloatArray,
-    reach_m: float,
-    voxel_m: float,
-) -> int:
-    """Return the number of points that are in occupied cells of a grid when they are moved.
-
-    Args:
-        occupied: (C, C, C) cells.
-        motion: (4, 4) from the frame of the points to that of the grid.
-        points: (N, 3) metres.
-        reach_m: distance of the lower bounds of the grid from the origin.
-        voxel_m: size of a cell.
-    """
-    count, cells, cell = 0, len(occupied), np.empty(3)
-    for i in range(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        for a in range(3):  # the operations of `transform_points`, in their order
-            moved = (x * motion[a, 0] + y * motion[a, 1] + z * motion[a, 2]) + motion[a, 3]
-            cell[a] = (moved + reach_m) / voxel_m
-        if 0 <= cell[0] < cells and 0 <= cell[1] < cells and 0 <= cell[2] < cells:
-            count += occupied[int(cell[0]), int(cell[1]), int(cell[2])]
-    return count
+    (voxels,) = warped_voxels(points, _SPACE, np.pad(motion[None, :3], ((0, 0), (0, 0), (0, 1))))
+    return np.count_nonzero(occupied.reshape(-1)[voxels[voxels < occupied.size]]) / len(points)

@@ -4,9 +4,10 @@ grid are unchanged since its report.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -44,96 +45,71 @@ _ADVICE = (
 )
 
 
-class Freshness:
-    """Compares the files of a sequence with the reports beside its grids.
+def check_reports(sequence: Sequence, frames: Iterable[int]) -> Iterator[Finding]:
+    """Compare the files of some frames with the reports beside the grids of a sequence.
 
-    Args:
-        sequence: the sequence; grids without a report are left out.
+    Files that cannot be read are skipped: other checks report them.
     """
 
-    def __init__(self, sequence: Sequence) -> None:
-        self.sequence = sequence
-        self.reports: dict[str, Report] = {}
-        self._damaged: list[Finding] = []
-        self._rows: dict[str, dict[int, int]] = {}
-        self._compared: dict[str, int] = {}
-        self._changed: dict[tuple[str, str], list[int]] = {}  # frames by grid and field
-        for name in sequence.documents():
-            grid, _, file = name.rpartition("/")
-            if file == layout.REPORT:
-                self._read(grid, name)
-
-    def _read(self, grid: str, name: str) -> None:
-        where = f"{self.sequence.location}/{name}"
-        try:
-            report = Report.from_json(self.sequence.read_document(name), where)
-        except CarlascError as error:
-            finding = Finding.from_error("report", where, error, _ADVICE)
-            self._damaged.append(replace(finding, severity="warning"))
-            return
-        self.reports[grid] = report
-        self._rows[grid] = {frame: row for row, frame in enumerate(report.frames)}
-
-    def compare(self, frame: int) -> None:
-        """Compare the files of one frame.
-
-        Files that cannot be read are skipped: other checks report them.
-        """
-        seen: dict[str, str | None] = {}
-        for grid, report in self.reports.items():
-            row = self._rows[grid].get(frame)
-            if row is None:
-                continue
-            self._compared[grid] = self._compared.get(grid, 0) + 1
-            for field, digests in report.digests.items():
-                if field not in seen:
-                    seen[field] = self._digest(field, frame)
-                if seen[field] is not None and seen[field] != (digests.of(row) or ""):
-                    self._changed.setdefault((grid, field), []).append(frame)
-
-    def _digest(self, field: str, frame: int) -> str | None:
-        """Return the digest of a field of a frame, "" if it does not exist; None if it cannot be
-        read.
-        """
-        if frame not in self.sequence.frames(field):
+    @cache  # reports of several grids name the same fields of scans
+    def digest(field: str, frame: int) -> str | None:
+        """Return the digest of a field, "" if it does not exist; None if it cannot be read."""
+        if frame not in sequence.frames(field):
             return ""
         try:
-            return short(digest_of(field, self.sequence.read(field, frame)))
+            return short(digest_of(field, sequence.read(field, frame)))
         except (CarlascError, OSError):
             return None
 
-    def findings(self) -> Iterator[Finding]:
-        """Yield a finding for each difference from the reports."""
-        yield from self._damaged
-        for grid, report in self.reports.items():
-            for expected, found in self._differences(grid, report):
-                yield self._finding("warning", grid, expected, found)
-            missing = set(self.sequence.frames(f"{grid}/labels").tolist()) - set(report.frames)
-            if missing:
-                found = f"{len(missing)} frames that it does not cover"
-                yield self._finding("note", grid, "a report of all frames", found)
-            yield from check_actors(self.sequence, grid, report.actors or ())
+    for name in sequence.documents():
+        grid, _, file = name.rpartition("/")
+        if file != layout.REPORT:
+            continue
+        where = f"{sequence.location}/{name}"
+        try:
+            report = Report.from_json(sequence.read_document(name), where)
+        except CarlascError as error:
+            yield replace(Finding.from_error("report", where, error, _ADVICE), severity="warning")
+            continue
+        where = f"{sequence.location}/{grid}"
+        for expected, found in _differences(sequence, grid, report, frames, digest):
+            yield Finding("warning", "report", where, expected, found, _ADVICE)
+        if missing := set(sequence.frames(f"{grid}/labels").tolist()) - set(report.frames):
+            expected, found = (
+                "a report of all frames",
+                f"{len(missing)} frames that it does not cover",
+            )
+            yield Finding("note", "report", where, expected, found, _ADVICE)
+        yield from check_actors(sequence, grid, report.actors or ())
 
-    def _differences(self, grid: str, report: Report) -> Iterator[tuple[str, str]]:
-        """Yield what was expected and what was found, for each difference from a report."""
-        if report.settings != self.sequence.params(grid):
-            yield "the settings in its report", "another params.json"
-        for name, digest in report.documents.items():
-            if name == layout.params_file(grid):
-                continue
-            exists = name in self.sequence.documents()
-            if not exists or not digest.matches(self.sequence.read_document(name)):
-                found = f"a {name} that changed since" if exists else f"no {name}"
-                yield f"the {name} that its report was made from", found
-        for (own, field), changed in self._changed.items():
-            if own == grid:
-                frames = f"{len(changed)} of {self._compared[grid]} compared frames"
-                found = f"{frames} changed since, the first is {changed[0]}"
-                yield f"the {field} that its report was made from", found
 
-    def _finding(self, severity: Severity, grid: str, expected: str, found: str) -> Finding:
-        where = f"{self.sequence.location}/{grid}"
-        return Finding(severity, "report", where, expected, found, _ADVICE)
+def _differences(
+    sequence: Sequence,
+    grid: str,
+    report: Report,
+    frames: Iterable[int],
+    digest: Callable[[str, int], str | None],
+) -> Iterator[tuple[str, str]]:
+    """Yield what was expected and what was found, for each difference from a report."""
+    if report.settings != sequence.params(grid):
+        yield "the settings in its report", "another params.json"
+    for name, made_from in report.documents.items():
+        exists = name in sequence.documents()
+        is_same = exists and made_from.matches(sequence.read_document(name))
+        if name != layout.params_file(grid) and not is_same:
+            found = f"a {name} that changed since" if exists else f"no {name}"
+            yield f"the {name} that its report was made from", found
+    rows = {frame: row for row, frame in enumerate(report.frames)}
+    compared = [frame for frame in frames if frame in rows]
+    for field, digests in report.digests.items():
+        seen = {frame: digest(field, frame) for frame in compared}
+        changed = [
+            frame for frame, own in seen.items() if own not in (None, digests.of(rows[frame]) or "")
+        ]
+        if changed:
+            of = f"{len(changed)} of {len(compared)} compared frames"
+            found = f"{of} changed since, the first is {changed[0]}"
+            yield f"the {field} that its report was made from", found
 
 
 _SAMPLES = 40  # frames per sequence whose contents are read by default
@@ -142,8 +118,6 @@ _DOUBTFUL_SHARE = 0.7  # and a smaller one than this a warning
 # coarser voxels contain several classes and much free space, so that a small share is no mistake
 _COARSE_M = 0.75
 _NO_OVERLAP = 0.3  # a smaller overlap of scans under the poses is a warning
-
-Progress = Callable[[int, int], None]
 
 
 def validate(
@@ -207,10 +181,9 @@ class _CheckedFrames:
 
 
 def _plan(sequence: Sequence, every: int | None) -> _CheckedFrames:
-    numbers: set[int] = set()
+    numbers = set[int]()
     with suppress(CarlascError):  # which is reported when the sequence is examined
-        for name in sequence.fields():
-            numbers.update(sequence.frames(name).tolist())
+        numbers.update(*(sequence.frames(name).tolist() for name in sequence.fields()))
     frames = tuple(sorted(numbers))
     read = frames[:: every or max(1, len(frames) // _SAMPLES)]
     # opening a local file is cheap; a frame of a packed store must be decoded, and has the right
@@ -240,15 +213,13 @@ def _examine(plan: _CheckedFrames, step: Callable[[], None] = lambda: None) -> _
         step()
     evidence: dict[str, GridEvidence] = {}
     below: dict[str, GroundBelow] = {}
-    freshness = Freshness(sequence) if described else None
     for frame in plan.read:
-        if freshness is not None:
+        if described:
             findings.extend(check_values(sequence, frame))
             _measure_grids(sequence, frame, evidence, below)
-            freshness.compare(frame)
         step()
-    if freshness is not None:
-        findings.extend(freshness.findings())
+    if described:
+        findings.extend(check_reports(sequence, plan.read))
     shares = {}
     for name, grid in evidence.items():
         diagnosis = grid.diagnose()
@@ -405,7 +376,7 @@ def _largest_edge(spec: GridSpec) -> float:
 def _judge_poses(sequence: Sequence, diagnosis: PoseDiagnosis) -> Iterator[Finding]:
     quality, correction = diagnosis.quality, diagnosis.correction
     mounting = None if quality is None else quality.mounting
-    described = None if mounting is None else describe_mounting(mounting, layout.FRAME_PERIOD_S)
+    described = None if mounting is None else describe_mounting(mounting)
     check, expected = "poses-on-scans", "scans that overlap under the poses"
     overlap = f"{diagnosis.share:.1%} of a scan's structure overlaps that of an earlier scan"
     severity: Severity = "warning"

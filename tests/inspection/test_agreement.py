@@ -31,7 +31,7 @@ SHIFTS = np.array([(x, y, z) for x in (0, -1, 1) for y in (0, -1, 1) for z in (0
 
 def count(grid, points, classes, shifts):
     """Return (S, 3) points in known voxels, of these in voxels of their class, and of any class."""
-    found = labels_at(points, grid.spec, grid.labels, grid.known, shifts=shifts)[0]
+    found = labels_at(points, grid.spec, grid.labels, grid.known, shifts=shifts)
     known = found >= 0
     return np.stack([known, known & (found == classes), found > 0], axis=2).sum(axis=1)
 

@@ -34,7 +34,7 @@ def test_correct_poses_need_no_explanation(winding, jitter_m):
     assert not mounting.wrong.any()
     assert mounting.determined.tolist() == [True, True, False, True, True, True, True]
     assert (np.abs(mounting.values) < 4 * mounting.errors + 1e-3)[mounting.determined].all()
-    assert describe_mounting(mounting, 0.1) is None
+    assert describe_mounting(mounting) is None
 
 
 def test_scans_that_are_not_corrected_for_motion_raise_no_alarm():
@@ -89,7 +89,7 @@ def test_the_messages_say_what_to_do():
         names = ("x", "y", "z", "roll", "pitch", "yaw", "late")
         errors = np.array([0.02, 0.02, 9.0, 0.001, 0.001, 0.001, 0.005])
         return describe_mounting(
-            Mounting(np.array([values.get(name, 0.0) for name in names]), errors), 0.1
+            Mounting(np.array([values.get(name, 0.0) for name in names]), errors)
         )
 
     late, fix_late = described(late=0.2)

@@ -17,7 +17,7 @@ from carlasc.groundtruth import FromScans, regrid
 from carlasc.inspection import report, validate, write_report_page
 from carlasc.inspection.report_page import describe
 from carlasc.inspection.reports import ReportResult
-from carlasc.inspection.validation import Freshness
+from carlasc.inspection.validation import check_reports
 from carlasc.storage import FolderSink, layout
 
 FRAMES = 7
@@ -211,9 +211,7 @@ def test_actors_that_free_space_shows_are_counted_and_many_doubtful_ones_are_a_w
 
 def test_a_frame_of_no_report_is_not_compared(made):
     (sequence,) = carlasc.open(made).sequences().values()
-    freshness = Freshness(sequence)
-    freshness.compare(1000)
-    assert list(freshness.findings()) == []
+    assert list(check_reports(sequence, [1000])) == []
 
 
 class Checked(HTMLParser):

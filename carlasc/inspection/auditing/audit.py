@@ -5,14 +5,14 @@ grids.
 from __future__ import annotations
 
 import io
-import json
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import closing, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from hashlib import sha256
-from itertools import chain
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -62,49 +62,36 @@ _Row = tuple[str, int, int, int]
 class _Stretch:
     """Some successive frames of a sequence, which a worker counts, and the place of their sums."""
 
-    counter: FrameCounter
+    matched: MatchedGrids
+    window: tuple[int, int] | None
     frames: tuple[tuple[int, int], ...]
     writer: SequenceWriter | None
     scans: str  # digest
+    actors: MovingActors = field(default_factory=MovingActors)
 
+    @cached_property
     def key(self) -> str:
-        """Return the name of the sums, which differs for other grids, other scans or another
-        window.
-        """
-        one, content = self.counter.matched, sha256()
+        """The name of the sums, which differs for other grids, other scans or another window."""
+        one, content = self.matched, sha256()
         for number, _ in self.frames:
             with suppress(CarlascError, OSError):  # which is reported when the frame is counted
-                labels, _, known = one.read(number)
-                content.update(
-                    labels.tobytes() + (b"" if known is None else np.packbits(known).tobytes())
-                )
-        about = [
-            _VERSION,
-            one.path,
-            str(one.spec),
-            one.spec.lower,
-            one.spec.upper,
-            self.frames,
-            self.counter.window,
-        ]
-        return sha256(
-            json.dumps([about, self.scans, content.hexdigest()], default=str).encode()
-        ).hexdigest()
+                for array in one.read(number):
+                    content.update(b"" if array is None else array.tobytes())
+        about = (one.path, one.spec, self.frames, self.window, self.scans)
+        return sha256(repr((_VERSION, *about, content.digest())).encode()).hexdigest()
 
     def read(self) -> Sums | None:
         """Return the sums of another run or part."""
-        return (
-            None
-            if self.writer is None
-            else read_derived(self.writer, _SUMS, self.key(), _sums_from)
-        )
+        if self.writer is None:
+            return None
+        return read_derived(self.writer, _SUMS, self.key, _sums_from)
 
     def count(self) -> tuple[Sums, list[AuditFailure]]:
         """Count the frames, unless another run did; return those that cannot be read."""
         if (kept := self.read()) is not None:
             return kept, []
-        counter, sums = replace(self.counter), Sums()  # whose caches end with it
-        worst, failures = [], []
+        counter = FrameCounter(self.matched, self.actors, self.window)
+        sums, worst, failures = Sums(), [], []
         for number, frame in self.frames:
             try:
                 kinds = counter.add_frame(sums, number, frame)
@@ -114,15 +101,14 @@ class _Stretch:
                 worst.append((number, frame, np.count_nonzero(kinds > OCCUPIED)))
         sums[_WORST] = np.array(worst, np.int64).reshape(-1, 3)
         if self.writer is not None and not failures:
-            buffer, key = io.BytesIO(), self.key()
-            np.savez_compressed(buffer, **{_KEY: np.array(key)}, **sums)  # type: ignore[arg-type]
-            self.writer.write_document(layout.derived(_SUMS, key), buffer.getvalue())
+            buffer, entries = io.BytesIO(), {_KEY: np.array(self.key), **sums}
+            np.savez_compressed(buffer, **entries)  # type: ignore[arg-type]
+            self.writer.write_document(layout.derived(_SUMS, self.key), buffer.getvalue())
         return sums, failures
 
     def failure(self, number: int, message: str) -> AuditFailure:
         """Return why a frame could not be counted."""
-        one = self.counter.matched
-        return AuditFailure(one.path, one.grids.name_of(number), message)
+        return AuditFailure(self.matched.path, self.matched.grids.name_of(number), message)
 
 
 def _sums_from(data: bytes, where: str) -> tuple[Sums, str]:
@@ -180,14 +166,12 @@ def audit(
         )
     matched = match_grids(grids, scans, grid, frames)
     notes = [f"{one.path}: {note}" for one in matched for note in one.notes]
-    stretches = list(chain.from_iterable(_stretches_of(one, made_from, keep) for one in matched))
+    stretches = [part for one in matched for part in _stretches_of(one, made_from, keep)]
     with one_pool(run) as spread:
-        sums, worst, failures, is_whole = _count_all(stretches, spread, notes)
-    verdicts = (
-        {one.path: _judge(Stretches(sums[one.path]), one, made_from) for one in matched}
-        if is_whole
-        else {}
-    )
+        sums, worst, failures = _count_all(stretches, spread, notes)
+    verdicts = {}
+    if sums is not None:
+        verdicts = {one.path: _judge(Stretches(sums[one.path]), one, made_from) for one in matched}
     return AuditResult(
         grids.location if isinstance(grids, Source) else str(grids),
         scans.location if isinstance(scans, Source) else str(scans),
@@ -208,14 +192,10 @@ def voxels_of(
     """Count a frame of an audit again: return its grids, and the states of its voxels (see
     `FrameCounter.add_frame`).
     """
-    one = next(
-        one
-        for one in match_grids(result.grids, result.scans, result.grid, None)
-        if one.path == path
-    )
-    return one, FrameCounter(one, _actors_of(one, frame, frame, Run(workers=1), [])).add_frame(
-        {}, number, frame
-    )
+    matched = match_grids(result.grids, result.scans, result.grid, None)
+    one = next(one for one in matched if one.path == path)
+    counter = FrameCounter(one, _actors_of(one, frame, frame, Run(workers=1), []))
+    return one, counter.add_frame({}, number, frame)
 
 
 def _judge(
@@ -233,19 +213,11 @@ def _stretches_of(
     writer, digest, scans = None, "", one.scans.frames("points")
     if keep is not None:
         writer, digest = FolderSink(keep).sequence(one.path), scans_digest(one.scans, scans)
-        digest = (
-            derived_key(one.scans, scans, digest)
-            if layout.POSES in one.scans.documents()
-            else digest
-        )
+        if layout.POSES in one.scans.documents():
+            digest = derived_key(one.scans, scans, digest)
     size = int(np.clip(len(one.frames) // _STRETCHES, 1, _STRETCH))
     for first in range(0, len(one.frames), size):
-        yield _Stretch(
-            FrameCounter(one, MovingActors(), window),
-            one.frames[first : first + size],
-            writer,
-            digest,
-        )
+        yield _Stretch(one, window, one.frames[first : first + size], writer, digest)
 
 
 def _with_actors(stretches: Iterable[_Stretch], run: Run, notes: list[str]) -> Iterator[_Stretch]:
@@ -253,23 +225,18 @@ def _with_actors(stretches: Iterable[_Stretch], run: Run, notes: list[str]) -> I
 
     Actors are found for some hundred frames at a time, to bound memory.
     """
-    known, actors = ("", -1), MovingActors()
-    for stretch in stretches:
-        if stretch.read() is None:
-            one, (first, last) = (
-                stretch.counter.matched,
-                (stretch.frames[0][1], stretch.frames[-1][1]),
-            )
-            block = first // _BLOCK
-            if known != (one.path, block):
-                known = one.path, block
-                actors = _actors_of(
-                    one, block * _BLOCK, (block + 1) * _BLOCK + last - first, run, notes
-                )
-            near = actors.between(first - _REACH, last + _REACH)
-            yield replace(stretch, counter=replace(stretch.counter, actors=near))
-        else:
-            yield stretch
+    blocks = groupby(stretches, lambda one: (one.matched.path, one.frames[0][1] // _BLOCK))
+    for (_, block), parts in blocks:
+        actors = None
+        for stretch in parts:
+            if stretch.read() is not None:
+                yield stretch
+                continue
+            first, last = stretch.frames[0][1], stretch.frames[-1][1]
+            if actors is None:
+                end = (block + 1) * _BLOCK + last - first
+                actors = _actors_of(stretch.matched, block * _BLOCK, end, run, notes)
+            yield replace(stretch, actors=actors.between(first - _REACH, last + _REACH))
 
 
 def _actors_of(
@@ -298,32 +265,30 @@ def _actors_of(
 
 def _count_all(
     stretches: list[_Stretch], run: Run, notes: list[str]
-) -> tuple[dict[str, list[Sums]], list[_Row], list[AuditFailure], bool]:
-    """Count the stretches of this part, and read those of others: sums by sequence, worst frames,
-    failures, and whether all exist.
+) -> tuple[dict[str, list[Sums]] | None, list[_Row], list[AuditFailure]]:
+    """Count the stretches of this part, and read those of others: sums by sequence, or None if some
+    do not exist yet; worst frames; failures.
     """
     own = run.part.take(range(len(stretches)))
     steps = StepCounter(run.progress, sum(len(stretch.frames) for stretch in stretches))
     steps(0)
-    lengths = Counter(stretch.counter.matched.path for stretch in stretches)
+    lengths = Counter(stretch.matched.path for stretch in stretches)
     sums = {path: [Sums() for _ in range(min(length, _DRAWN))] for path, length in lengths.items()}
     worst, failures, is_whole, rows = list[_Row](), list[AuditFailure](), True, Counter[str]()
     tasks = _with_actors((stretches[index] for index in own), run, notes)
     with closing(run_all(_Stretch.count, tasks, run, lost=_fail)) as results:
         for index, stretch in enumerate(stretches):
             counted, failed = next(results) if index in own else (stretch.read(), [])
-            path, is_whole = stretch.counter.matched.path, is_whole and counted is not None
+            is_whole &= counted is not None
+            counts, path = {**(counted or {})}, stretch.matched.path
             steps(len(stretch.frames))
             failures += failed
-            for name, counts in (counted or {}).items():
-                if name == _WORST:
-                    worst += [
-                        (path, number, frame, wrong) for number, frame, wrong in counts.tolist()
-                    ]
-                else:
-                    add(sums[path][rows[path] * len(sums[path]) // lengths[path]], name, counts)
+            rows_of = counts.pop(_WORST, np.empty((0, 3), np.int64)).tolist()
+            worst += [(path, number, frame, wrong) for number, frame, wrong in rows_of]
+            for name, array in counts.items():
+                add(sums[path][rows[path] * len(sums[path]) // lengths[path]], name, array)
             rows[path] += 1
-    return sums, worst, failures, is_whole
+    return sums if is_whole else None, worst, failures
 
 
 def _fail(stretch: _Stretch, message: str) -> tuple[Sums, list[AuditFailure]]:

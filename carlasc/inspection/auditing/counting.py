@@ -4,9 +4,9 @@ number of frames.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -20,12 +20,13 @@ from carlasc.core.arrays import (
     LabelArray,
     Uint8Array,
 )
-from carlasc.core.cells import first_of_cells
+from carlasc.core.cells import Cells, count_points, find_voxel, first_of_cells
+from carlasc.core.compiling import cached
 from carlasc.core.geometry import invert, thin, transform_points
+from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan
 from carlasc.errors import CarlascError
-from carlasc.inspection.auditing.geometry import Family, families
-from carlasc.inspection.auditing.loops import crossings, grown, voxels_at
+from carlasc.inspection.auditing.geometry import families
 from carlasc.inspection.auditing.matching import MatchedGrids
 from carlasc.inspection.auditing.verdicts import Sums, add
 from carlasc.inspection.heldout_scores import BANDS_M, lowest_of_columns
@@ -95,7 +96,7 @@ class FrameCounter:
     matched: MatchedGrids
     actors: MovingActors
     window: tuple[int, int] | None = None
-    _scans: dict[int, Scan] = field(default_factory=dict, init=False, repr=False)
+    # points of scans: the counter of a stretch of frames needs few of them
     _spread: dict[int, FloatArray] = field(default_factory=dict, init=False, repr=False)
 
     def add_frame(self, sums: Sums, number: int, frame: int) -> Uint8Array:
@@ -135,30 +136,24 @@ class FrameCounter:
         turns = spec.coordinates == "cylindrical"
         return _Frame(frame, scan, points, voxels, kinds, occupied, known, crossed, turns)
 
-    def _scan(self, frame: int) -> Scan:
-        if frame not in self._scans:
-            self._scans[frame] = self.matched.scans.scan(frame, ("labels", "instances", "origins"))
-            while len(self._scans) > _KEPT:
-                self._scans.pop(next(iter(self._scans)))
-        return self._scans[frame]
+    @cached_property
+    def _scan(self) -> Callable[[int], Scan]:
+        read = self.matched.scans.scan
+        return lru_cache(_KEPT)(lambda frame: read(frame, ("labels", "instances", "origins")))
 
     # Geometry
-
-    @cached_property
-    def _families(self) -> list[Family]:
-        return families(self.matched.spec)
 
     def _fits(self, seen: _Frame) -> IntArray:
         """Return (H, 2) points, and those in occupied voxels, under all corrections of all
         families.
         """
-        drift, lag = self._families[-2:]
+        *others, drift, lag = families(self.matched.spec)
         own = self._fit_points(seen.number)
-        counts = [self._fit(seen, family.warps, own) for family in self._families[:-2]]
+        counts = [self._fit(seen, family.warps, own) for family in others]
         drifts = np.zeros((len(drift.values), 2), np.int64)
         for other in (seen.number - _APART, seen.number + _APART):
             if (placed := self._standing(seen.number, other)) is not None:
-                later_s = self._second(other) - self._second(seen.number)
+                later_s = self.matched.seconds[other] - self.matched.seconds[seen.number]
                 drifts += self._fit(seen, drift.warps, thin(placed, self._most), later_s)
         lags = [
             self._fit(seen, lag.warps[:1], self._fit_points(seen.number + int(value)))
@@ -167,17 +162,11 @@ class FrameCounter:
         return np.concatenate([*counts, drifts, *lags])
 
     def _fit(
-        self,
-        seen: _Frame,
-        warps: FloatArray,
-        points: FloatArray,
-        later_s: float = 0.0,
+        self, seen: _Frame, warps: FloatArray, points: FloatArray, later_s: float = 0.0
     ) -> IntArray:
-        at_points = labels_at(
-            points, self.matched.spec, seen.occupied, warps=warps, later_s=later_s
-        )
-        occupied = (at_points[:, 0] > 0).sum(axis=1)
-        return np.column_stack([np.full(len(warps), len(points)), occupied])
+        spec, occupied = self.matched.spec, seen.occupied
+        at_points = labels_at(points, spec, occupied, warps=warps, later_s=later_s)
+        return np.column_stack([np.full(len(warps), len(points)), (at_points > 0).sum(axis=1)])
 
     @property
     def _most(self) -> int:
@@ -188,19 +177,14 @@ class FrameCounter:
         cannot be read.
         """
         if frame not in self._spread:
-            spec, edge = self.matched.spec, float(self.matched.spec.voxel_size[[0, 2]].min()) / 2
-            scan = self._other(frame)
-            some = (
-                np.empty((0, 3), np.float32)
-                if scan is None
-                else thin(scan.points[_are_returns(scan)], _SPREAD)
-            )
-            points = self.matched.place(
-                some[first_of_cells(np.floor(some / edge).astype(np.int64))]
-            )
+            spec, scan = self.matched.spec, self._other(frame)
+            edge = float(spec.voxel_size[[0, 2]].min()) / 2
+            some = np.empty((0, 3), np.float32)
+            if scan is not None:
+                some = thin(scan.points[_are_returns(scan)], _SPREAD)
+            some = some[first_of_cells(np.floor(some / edge).astype(np.int64))]
+            points = self.matched.place(some)
             self._spread[frame] = thin(points[spec.flat_index(points) >= 0], self._most)
-            while len(self._spread) > _KEPT:
-                self._spread.pop(next(iter(self._spread)))
         return self._spread[frame]
 
     # Scans at other times
@@ -210,35 +194,26 @@ class FrameCounter:
         frame reports the error).
         """
         try:
-            return None if self._row(frame) is None else self._scan(frame)
+            return self._scan(frame) if frame in self.matched.seconds else None
         except (CarlascError, OSError):
             return None
 
-    def _row(self, frame: int) -> int | None:
-        frames = self.matched.trajectory[0]
-        row = int(np.searchsorted(frames, frame))
-        return row if row < len(frames) and int(frames[row]) == frame else None
-
-    def _second(self, frame: int) -> float:
-        return float(self.matched.trajectory[1][self._row(frame)])
-
     def _grid_T_world(self, frame: int) -> FloatArray | None:
-        poses = self.matched.trajectory[2]
-        return None if poses is None else self.matched.grid_T_scan @ invert(poses[self._row(frame)])
+        pose = self.matched.poses.get(frame)
+        return None if pose is None else self.matched.grid_T_scan @ invert(pose)
 
     def _standing(self, frame: int, other: int) -> FloatArray | None:
         """Return (N, 3) returns of another scan inside the grid of a frame, without classes that
         can move; None without the scan.
         """
-        grid_T_world, poses = self._grid_T_world(frame), self.matched.trajectory[2]
-        if grid_T_world is None or poses is None or (scan := self._other(other)) is None:
+        grid_T_world, scan = self._grid_T_world(frame), self._other(other)
+        if grid_T_world is None or scan is None:
             return None
         keep = _are_returns(scan)
         if scan.labels is not None:
             keep &= ~np.isin(scan.labels, sorted(self.matched.scans.metadata.classes.movable))
-        placed = transform_points(
-            grid_T_world @ poses[self._row(other)], thin(scan.points[keep], _SPREAD)
-        )
+        grid_T_scan = grid_T_world @ self.matched.poses[other]
+        placed = transform_points(grid_T_scan, thin(scan.points[keep], _SPREAD))
         return placed[self.matched.spec.flat_index(placed) >= 0]
 
     def _add_held_out(self, sums: Sums, seen: _Frame) -> None:
@@ -257,11 +232,8 @@ class FrameCounter:
         columns with ground at one and at two heights.
         """
         lookup, labels = self.matched.lookup, seen.scan.labels
-        add(
-            sums,
-            "classes of grids",
-            np.bincount(seen.labels[seen.occupied].astype(np.int64), minlength=MAX_ID + 1),
-        )
+        classes = np.bincount(seen.labels[seen.occupied], minlength=MAX_ID + 1)
+        add(sums, "classes of grids", classes)
         if self.matched.ground:
             ground = seen.occupied & np.isin(seen.labels, self.matched.ground)
             layers = (ground & ~np.pad(ground, ((0, 0), (0, 0), (1, 0)))[:, :, :-1]).sum(axis=2)
@@ -280,13 +252,12 @@ class FrameCounter:
         """Count returns in free voxels by class, distance and height, and return these voxels."""
         wrong = np.zeros(seen.occupied.shape, np.bool_)
         if seen.known is not None:
-            at_points = labels_at(seen.points, self.matched.spec, seen.occupied, seen.known)[0, 0]
-            own = np.flatnonzero((at_points >= 0) & (seen.voxels >= 0))
-            free = at_points[own] == 0
+            own = np.flatnonzero(seen.voxels >= 0)
+            own = own[seen.known.reshape(-1)[seen.voxels[own]]]
+            free = ~seen.occupied.reshape(-1)[seen.voxels[own]]
             wrong.reshape(-1)[seen.voxels[own[free]]] = True
-            kinds = (
-                np.zeros(len(own), np.int64) if seen.scan.labels is None else seen.scan.labels[own]
-            )
+            labels = seen.scan.labels
+            kinds = np.zeros(len(own), np.int64) if labels is None else labels[own]
             self._add_by(sums, "returns", kinds, seen.points[own], free)
         return wrong
 
@@ -319,17 +290,13 @@ class FrameCounter:
     ) -> None:
         """Add (K, B, H, 2) counts by class, distance and height: all, and the wrong ones."""
         low, high = self.matched.spec.lower[2], self.matched.spec.upper[2]
-        heights = np.clip((points[:, 2] - low) / (high - low) * HEIGHTS, 0, HEIGHTS - 1).astype(
-            np.int64
-        )
+        heights = ((points[:, 2] - low) / (high - low) * HEIGHTS).clip(0, HEIGHTS - 1).astype(int)
         bands = np.searchsorted(BANDS_M, np.linalg.norm(points, axis=1), side="right") - 1
-        shape = (MAX_ID + 1, len(BANDS_M) - 1, HEIGHTS, 2)
-        cells = np.ravel_multi_index(
-            (np.minimum(kinds.astype(np.int64), MAX_ID), bands, heights, wrong.astype(np.int64)),
-            shape,
-        )
-        counts = np.bincount(cells, minlength=int(np.prod(shape))).reshape(shape)
-        add(sums, name, np.stack([counts.sum(axis=3), counts[..., 1]], axis=3))
+        counts = np.zeros((MAX_ID + 1, len(BANDS_M) - 1, HEIGHTS, 2), np.int64)
+        cells = np.minimum(kinds.astype(np.int64), MAX_ID), bands, heights
+        np.add.at(counts[..., 0], cells, 1)
+        np.add.at(counts[..., 1], cells, wrong)
+        add(sums, name, counts)
 
     def _add_unknown(self, sums: Sums, seen: _Frame) -> None:
         """Count unknown voxels by cause: they hold a return, a ray crosses them, they are outside
@@ -337,24 +304,23 @@ class FrameCounter:
         """
         if seen.known is None or not seen.hit.any():
             return
-        points = seen.points[seen.voxels >= 0]
-        angles = np.arctan2(
-            points[:, 2] - self.matched.height_m, np.hypot(points[:, 0], points[:, 1])
-        )
-        rest = ~seen.known & ~seen.hit & (seen.crossed == 0)
-        view = (self._elevations >= angles.min()) & (self._elevations <= angles.max())
-        crossed = ~seen.known & ~seen.hit & (seen.crossed > 0)
-        causes = [~seen.known & seen.hit, crossed, rest & ~view, rest & view]
+        angles = self._elevations(seen.points[seen.voxels >= 0])
+        of_voxels = self._elevations_of_voxels
+        view = (of_voxels >= angles.min()) & (of_voxels <= angles.max())
+        without, crossed = ~seen.known & ~seen.hit, seen.crossed > 0
+        rest = without & ~crossed
+        causes = [~seen.known & seen.hit, without & crossed, rest & ~view, rest & view]
         add(sums, "unknown", [seen.known.size, *(cause.sum() for cause in causes)])
 
+    def _elevations(self, points: AnyFloatArray) -> AnyFloatArray:
+        """Return the angle of each point above the horizon of the sensor."""
+        x, y, z = np.moveaxis(points, -1, 0)
+        return np.arctan2(z - self.matched.height_m, np.hypot(x, y))
+
     @cached_property
-    def _elevations(self) -> Float32Array:
-        x, y, z = np.moveaxis(
-            self.matched.spec.from_axes(self.matched.spec.centers().reshape(-1, 3)), -1, 0
-        )
-        return np.arctan2(z - self.matched.height_m, np.hypot(x, y), dtype=np.float32).reshape(
-            self.matched.spec.size
-        )
+    def _elevations_of_voxels(self) -> Float32Array:
+        spec = self.matched.spec
+        return self._elevations(spec.from_axes(spec.centers())).astype(np.float32)
 
     # Actors
 
@@ -379,11 +345,8 @@ class FrameCounter:
                 path = path[~here[path]]
                 if len(path):
                     trails[path[flat[path]]] = True
-                    add(
-                        sums,
-                        f"actor {_name(number, track)}",
-                        [len(path), flat[path].sum(), 0, 0, 0],
-                    )
+                    counts = [len(path), flat[path].sum(), 0, 0, 0]
+                    add(sums, f"actor {_name(number, track)}", counts)
         return trails.reshape(seen.occupied.shape)
 
     def _members(self, seen: _Frame) -> list[tuple[str, AnyIntArray]]:
@@ -428,7 +391,10 @@ class FrameCounter:
             for a, b in zip(lower, upper, strict=True)
         ]
         lattice = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
-        return voxels_at(lattice, grid_T_world @ np.stack(poses), spec)
+        counts = np.zeros(spec.num_voxels, np.int32)
+        for pose in poses:
+            count_points(lattice, grid_T_world @ pose, spec, counts)
+        return np.flatnonzero(counts)
 
 
 def _are_returns(scan: Scan) -> BoolArray:
@@ -438,9 +404,61 @@ def _are_returns(scan: Scan) -> BoolArray:
 
 
 def _name(number: int, track: Track) -> str:
-    is_named = 0 < track.instance < FIRST_FOUND
-    return (
-        str(track.instance)
-        if is_named
-        else f"of track {number}, first seen in scan {min(track.members, default=track.first)}"
-    )
+    if 0 < track.instance < FIRST_FOUND:
+        return str(track.instance)
+    first = min(track.members, default=track.first)
+    return f"of track {number}, first seen in scan {first}"
+
+
+_SAMPLES = 4  # samples on a ray per edge of the smallest voxel
+# least samples of a ray in a voxel that it crosses: rays that graze a corner do not count
+_INSIDE = 3
+
+
+def crossings(origins: FloatArray, points: FloatArray, spec: GridSpec, margin_m: float) -> IntArray:
+    """Return (X, Y, Z) how many rays cross each voxel, not only a corner of it, before they come
+    near their return.
+
+    Args:
+        origins: (N, 3) metres, where each ray begins, in the frame of the grid.
+        points: (N, 3) metres, the returns.
+        spec: geometry of the grid, Cartesian or cylindrical.
+        margin_m: rays end this far before their return.
+    """
+    crossed = np.zeros(spec.num_voxels + 1, np.int64)
+    edges = spec.voxel_size[[0, 2]] if spec.coordinates == "cylindrical" else spec.voxel_size
+    _cross(origins, points, Cells.of(spec), float(min(edges)) / _SAMPLES, margin_m, crossed)
+    return crossed[:-1].reshape(spec.size)
+
+
+@cached
+def _cross(origins, points, cells, step_m, margin_m, crossed):  # type: ignore[no-untyped-def]
+    outside = len(crossed) - 1
+    for i in range(len(points)):
+        x, y, z = origins[i, 0], origins[i, 1], origins[i, 2]
+        dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
+        if not length > margin_m:
+            continue
+        dx, dy, dz = dx / length, dy / length, dz / length
+        last, inside = outside, 0
+        for k in range(int((length - margin_m) / step_m)):
+            t = (k + 0.5) * step_m
+            voxel = find_voxel(x + t * dx, y + t * dy, z + t * dz, cells)
+            inside = inside + 1 if voxel == last else 1
+            last = voxel
+            if inside == _INSIDE:
+                crossed[voxel] += 1
+
+
+def grown(mask: BoolArray, turns: bool) -> BoolArray:
+    """Return a mask grown by one voxel in each direction; if `turns`, the azimuth of a cylindrical
+    grid is periodic.
+    """
+    for axis in range(3):
+        sides = [(1, 1) if a == axis else (0, 0) for a in range(3)]
+        wide = np.moveaxis(
+            np.pad(mask, sides, mode="wrap" if turns and axis == 1 else "constant"), axis, 0
+        )
+        mask = np.moveaxis(wide[:-2] | wide[1:-1] | wide[2:], 0, axis)
+    return mask

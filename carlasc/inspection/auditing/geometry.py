@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from carlasc.core.geometry import choices_of_axes, rotation_z
 from carlasc.core.grids import GridSpec
 from carlasc.errors import count
 from carlasc.inspection.auditing.matching import MatchedGrids
-from carlasc.inspection.auditing.verdicts import State, Stretches, Verdict
+from carlasc.inspection.auditing.verdicts import Stretches, Verdict
 
 # A correction must raise the share of points in occupied voxels by this much, and lower the share
 # of other points by this factor.
@@ -89,7 +89,7 @@ def judge_geometry(stretches: Stretches, one: MatchedGrids) -> Iterator[Verdict]
     sums = stretches.drawn("fits")
     if sums is None or not sums[0, 0, 0]:
         text = "no point of a scan is inside a grid"
-        yield Verdict("geometry", "undetermined", None, None, None, "", text, one.path)
+        yield Verdict.of(one.path, "geometry", "undetermined", text, unit="")
         return
     shares = np.where(sums[..., 0] > 0, sums[..., 1] / np.maximum(sums[..., 0], 1), -1.0)
     kinds = families(one.spec)
@@ -104,15 +104,12 @@ def judge_geometry(stretches: Stretches, one: MatchedGrids) -> Iterator[Verdict]
         f"{own[0]:.1%} of the points of scans are in occupied voxels, {top:.1%} with the best "
         "correction"
     )
-    belongs, advice = top >= _BELONGS, ""
-    if not belongs:
-        advice = (
-            "check that scans and grids are of the same sequence and in a known coordinate frame; "
-            f"tried: {one.pair}"
-        )
-    state: State = "sound" if belongs else "fault"
-    yield Verdict("fit", state, float(own[0]), low, high, "share", text, one.path, advice)
-    if not belongs:
+    advice = (
+        "check that scans and grids are of the same sequence and in a known coordinate frame; "
+        f"tried: {one.pair}"
+    )
+    yield Verdict.of(one.path, "fit", top < _BELONGS, text, (float(own[0]), low, high), advice)
+    if top < _BELONGS:
         return
     faults = [fit for fit in fits if fit.is_measured and fit.is_fault]
     if not faults:
@@ -129,7 +126,7 @@ def judge_geometry(stretches: Stretches, one: MatchedGrids) -> Iterator[Verdict]
         if fit is winner or (both_shift and fit.gain >= _SAME * winner.gain):
             yield _fault(fit, faults, one)
     text = f"not judged before the fault of {winner.family.name} is corrected"
-    yield Verdict("other geometry", "undetermined", None, None, None, "", text, one.path)
+    yield Verdict.of(one.path, "other geometry", "undetermined", text, unit="")
 
 
 def _fault(fit: _Fit, faults: list[_Fit], one: MatchedGrids) -> Verdict:
@@ -149,9 +146,8 @@ def _fault(fit: _Fit, faults: list[_Fit], one: MatchedGrids) -> Verdict:
     )
     if family.kind == "axes":
         low = high = fit.value
-    return Verdict(
-        family.name, "fault", fit.value, low, high, family.unit, text, one.path, family.advice
-    )
+    found = (fit.value, low, high)
+    return Verdict.of(one.path, family.name, True, text, found, family.advice, family.unit)
 
 
 def _sound_or_not(fit: _Fit, where: str) -> Verdict:
@@ -159,27 +155,26 @@ def _sound_or_not(fit: _Fit, where: str) -> Verdict:
     the right value from others.
     """
     family, shares, (low, high) = fit.family, fit.shares[0], fit.interval
-    neutral, measured, unclear = float(family.values[family.neutral]), fit.value, ""
+    neutral = float(family.values[family.neutral])
+    found, unclear = (neutral, neutral, neutral), ""
     if family.kind == "axes":
-        others = np.flatnonzero(shares[1:] >= shares[0] - _ALIKE)
+        text, others = "those of the scans", np.flatnonzero(shares[1:] >= shares[0] - _ALIKE)
         unclear = f"the scene looks the same with {AXES[others[0] + 1][0]}" if len(others) else ""
-        text, measured, low, high = "those of the scans", neutral, neutral, neutral
     elif family.kind == "lag":
-        near = shares[np.abs(family.values) == 1]
-        unclear = (
-            "the vehicle hardly moves" if (near >= shares[family.neutral] - _ALIKE).any() else ""
-        )
-        text, measured, low, high = "grids fit their own scans best", neutral, neutral, neutral
+        text, near = "grids fit their own scans best", shares[np.abs(family.values) == 1]
+        is_alike = (near >= shares[family.neutral] - _ALIKE).any()
+        unclear = "the vehicle hardly moves" if is_alike else ""
     else:
-        unclear = f"any value from {low:.3g} to {high:.3g} {family.unit} fits this drive"
-        unclear = unclear if high - low > family.widest else ""
+        found = (fit.value, low, high)
         small = "" if fit.value == neutral else ", too little to matter"
         text = f"{fit.value:.3g} {family.unit} (95 %: {low:.3g} to {high:.3g}){small}"
+        if high - low > family.widest:
+            unclear = f"any value from {low:.3g} to {high:.3g} {family.unit} fits this drive"
     if not fit.is_measured:
         unclear = "no other scans near enough, or no poses"
     if unclear:
-        return Verdict(family.name, "undetermined", None, None, None, family.unit, unclear, where)
-    return Verdict(family.name, "sound", measured, low, high, family.unit, text, where)
+        return Verdict.of(where, family.name, "undetermined", unclear, unit=family.unit)
+    return Verdict.of(where, family.name, False, text, found, unit=family.unit)
 
 
 def _describe(fit: _Fit, one: MatchedGrids) -> str:
@@ -244,6 +239,7 @@ class Family:
     advice: str
 
 
+@cache
 def families(spec: GridSpec) -> list[Family]:
     """Return the families of corrections of a grid."""
     advice, still = "give grids and scans the same axes", [np.eye(3)]

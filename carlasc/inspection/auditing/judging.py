@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -58,52 +59,32 @@ class _Judge:
     one: MatchedGrids
     window: tuple[int, int] | None
 
-    def _say(
-        self,
-        check: str,
-        state: State | bool,
-        text: str,
-        value: Share | float | None = None,
-        advice: str = "",
-        unit: str = "share",
-    ) -> Verdict:
-        """Return a verdict; True is a fault, and False is sound. Only a fault has advice.
-
-        A number without an interval was counted, not sampled.
-        """
-        named: State = state if isinstance(state, str) else "fault" if state else "sound"
-        share = value if isinstance(value, tuple) else (value, value, value)
-        advice = advice if named == "fault" else ""
-        return Verdict(check, named, *share, unit, text, self.one.path, advice)
+    def _say(self, check: str, state: State | bool, text: str, *about: Any) -> Verdict:
+        return Verdict.of(self.one.path, check, state, text, *about)
 
     def voxels(self) -> Iterator[Verdict]:
         """Yield what is wrong in voxels."""
-        if self.stretches.stacked("returns") is None:
-            text = "the files do not distinguish free from unknown space"
-            yield self._say("false free", "undetermined", text)
-        else:
-            which = ("scans that may have made the grids", "the frame's own scan")[
-                self.window is not None
-            ]
-            yield self._by_class(
-                "returns",
-                "false free",
-                f"returns of {which} are in voxels called free",
-                (_FREE, _FREE_OF_CLASS),
-                self.one.scans.metadata.classes,
-                "make these voxels occupied",
-            )
+        which = (
+            "scans that may have made the grids" if self.window is None else "the frame's own scan"
+        )
+        yield self._by_class(
+            "returns",
+            "false free",
+            f"returns of {which} are in voxels called free",
+            (_FREE, _FREE_OF_CLASS),
+            self.one.scans.metadata.classes,
+            "make these voxels occupied",
+        )
         if self.window is not None:
-            held_out = self.stretches.share("held out")
-            text = "no frame has a scan just outside of the window, with poses and a mask"
-            if held_out is not None:
-                text = (
-                    f"{_percent(held_out)} of the returns of static objects in scans that took no "
-                    "part in the grids are in free voxels"
-                )
-            state = _is_above(held_out, _FREE)
-            advice = "make these voxels occupied or unknown"
-            yield self._say("false free, held out", state, text, held_out, advice)
+            yield self._share(
+                "held out",
+                "false free, held out",
+                "of the returns of static objects in scans that took no part in the grids are in "
+                "free voxels",
+                _FREE,
+                "no frame has a scan just outside of the window, with poses and a mask",
+                "make these voxels occupied or unknown",
+            )
         yield self._by_class(
             "seen voxels",
             "phantoms",
@@ -113,14 +94,24 @@ class _Judge:
             "make these voxels free",
         )
         yield from self._actors()
-        doubled = self.stretches.share("ground columns")
-        text = f"{_percent(doubled)} of the columns with ground have it at two heights"
-        if doubled is None:
-            text = "no class of the grids is ground"
-        advice = "refine the poses that the grids were made with: they drift in height"
-        state = _is_above(doubled, _DOUBLED)
-        yield self._say("doubled ground", state, text, doubled, advice)
+        yield self._share(
+            "ground columns",
+            "doubled ground",
+            "of the columns with ground have it at two heights",
+            _DOUBLED,
+            "no class of the grids is ground",
+            "refine the poses that the grids were made with: they drift in height",
+        )
         yield from self._labels()
+
+    def _share(
+        self, name: str, check: str, what: str, limit: float, unknown: str, advice: str
+    ) -> Verdict:
+        """Return the verdict on a share, a fault if its whole interval is above a limit."""
+        share = self.stretches.share(name)
+        if share is None:
+            return self._say(check, "undetermined", unknown)
+        return self._say(check, share[1] > limit, f"{_percent(share)} {what}", share, advice)
 
     def _by_class(
         self,
@@ -133,7 +124,10 @@ class _Judge:
     ) -> Verdict:
         counts = self.stretches.stacked(name)
         if counts is None or not counts[..., 0].any():
-            return self._say(check, "undetermined", "nothing could be counted")
+            text = "nothing could be counted"
+            if counts is None and name == "returns":
+                text = "the files do not distinguish free from unknown space"
+            return self._say(check, "undetermined", text)
         total = counts.sum(axis=0)
         drawn = self.stretches.draw(counts.sum(axis=(1, 2, 3)))
         whole = share_of(drawn[:, 1], drawn[:, 0]) or (0.0, 0.0, 0.0)
@@ -161,49 +155,45 @@ class _Judge:
         return replace(verdict, details=", ".join([*named, *near, *levels]))
 
     def _actors(self) -> Iterator[Verdict]:
-        names = sorted({name for part in self.stretches.parts for name in part})
+        # voxels of the path of an actor, occupied ones, those it is seen in, occupied ones, frames
         actors = [
-            (name, drawn)  # voxels of its path, occupied ones, those it is seen in, occupied ones
-            for name in names
+            (name, drawn)
+            for name in sorted({name for part in self.stretches.parts for name in part})
             if name.startswith("actor ") and (drawn := self.stretches.drawn(name)) is not None
         ]
         moved = [(name, n) for name, n in actors if n[0, 0] >= _TRAIL_VOXELS]
-        paths = [(n[0, 1], name, share_of(n[:, 1], n[:, 0])) for name, n in moved]
-        trails = [row for row in paths if row[2] is not None and row[2][1] > _TRAIL]
-        listed = [f"{name} {_percent(path, 0)}" for _, name, path in sorted(trails, reverse=True)]
-        text, share = "no moving actor was found in the recording", None
         if moved:
+            paths = [(n[0, 1], name, _share_of_actor(n, 0)) for name, n in moved]
+            trails = sorted((row for row in paths if row[2][1] > _TRAIL), reverse=True)
+            listed = [f"{name} {_percent(path, 0)}" for _, name, path in trails]
             total = np.sum([n for _, n in moved], axis=0)
-            share = share_of(total[:, 1], total[:, 0])
+            share = _share_of_actor(total, 0)
             volume = total[0, 1] * float(np.prod(self.one.spec.voxel_size)) / self._frames[0]
             text = (
-                f"{share[0] if share else 0:.2%} of the paths of {count(len(moved), 'actor')} are "
+                f"{share[0]:.2%} of the paths of {count(len(moved), 'actor')} are "
                 f"occupied, {volume:.2f} m3 per frame"
             )
-        advice = (
-            f"leave out moving actors, or move their points along: {first_names(listed, _SHOWN)}"
-        )
-        state: State | bool = bool(trails) if moved else "undetermined"
-        yield self._say("ghost trails", state, text, share, advice)
+            advice = "leave out moving actors, or move their points along: "
+            advice += first_names(listed, _SHOWN)
+            yield self._say("ghost trails", bool(trails), text, share, advice)
+        else:
+            text = "no moving actor was found in the recording"
+            yield self._say("ghost trails", "undetermined", text)
         seen = [(name, n) for name, n in actors if n[0, 2] >= _ERASED_VOXELS]
-        own = [
-            (n[0, 2], name, share_of(n[:, 3], n[:, 2]), n[0, 4]) for name, n in seen if n[0, 4] > 1
-        ]
-        erased = sorted((row for row in own if row[2] and row[2][2] < _ERASED), reverse=True)
+        if not seen:
+            text = "no actor was found in the recording"
+            yield self._say("erased actors", "undetermined", text, None, "", "actors")
+            return
+        own = [(n[0, 2], name, _share_of_actor(n, 2), n[0, 4]) for name, n in seen if n[0, 4] > 1]
+        erased = sorted((row for row in own if row[2][2] < _ERASED), reverse=True)
         listed = [
-            f"{name} ({share[0] if share else 0:.0%} of its voxels in {frames:.0f} frames)"
+            f"{name} ({share[0]:.0%} of its voxels in {frames:.0f} frames)"
             for _, name, share, frames in erased
         ]
         text = f"{len(erased)} of {count(len(seen), 'actor')} have no voxels"
         text += f": {first_names(listed, _SHOWN)}" if erased else ""
-        advice = "keep the voxels of these actors"
-        if seen:
-            yield self._say(
-                "erased actors", bool(erased), text, float(len(erased)), advice, "actors"
-            )
-        else:
-            text = "no actor was found in the recording"
-            yield self._say("erased actors", "undetermined", text, unit="actors")
+        advice, number = "keep the voxels of these actors", float(len(erased))
+        yield self._say("erased actors", bool(erased), text, number, advice, "actors")
 
     @cached_property
     def _frames(self) -> tuple[int, int]:
@@ -292,11 +282,6 @@ class _Judge:
             yield self._say("unknown space", False, text, whole)
 
 
-def _is_above(share: Share | None, limit: float) -> State | bool:
-    """Return whether a whole interval is above a limit."""
-    return "undetermined" if share is None else share[1] > limit
-
-
 def _explains(
     drawn: FloatArray,
     rows: FloatArray,
@@ -314,6 +299,11 @@ def _explains(
     # the ground around a thin marking outvotes it
     lost = thin and drawn[0, j, i] < _EXPLAINED * rows[0, j]
     return j if own[2] < (_NONE if lost else _OWN) and moved[1] > _EXPLAINED else None
+
+
+def _share_of_actor(drawn: FloatArray, column: int) -> Share:
+    """Return the occupied share of the voxels of an actor, which has some."""
+    return share_of(drawn[:, column + 1], drawn[:, column]) or (0.0, 0.0, 0.0)
 
 
 def _percent(share: Share | None, digits: int = 2) -> str:

@@ -180,26 +180,24 @@ class MatchedGrids:
         return transform_points(self.grid_T_scan, points)
 
     @cached_property
-    def trajectory(
-        self,
-    ) -> tuple[IntArray, FloatArray, FloatArray | None]:
-        """(F,) frames with scans, their seconds, and (F, 4, 4) poses; None without poses.txt."""
-        frames, documents = self.scans.frames("points"), self.scans.documents()
-        poses = (
-            np.stack([self.scans.read_pose(f) for f in frames.tolist()])
-            if layout.POSES in documents
-            else None
-        )
-        return frames, self.scans.times_of(frames), poses
+    def seconds(self) -> dict[int, float]:
+        """Seconds of each frame with a scan, rising."""
+        frames = self.scans.frames("points")
+        return dict(zip(frames.tolist(), self.scans.times_of(frames).tolist(), strict=True))
+
+    @cached_property
+    def poses(self) -> dict[int, Transform]:
+        """(4, 4) pose of each frame with a scan; empty without poses.txt."""
+        if layout.POSES not in self.scans.documents():
+            return {}
+        return {frame: self.scans.read_pose(frame) for frame in self.seconds}
 
     @property
     def period_s(self) -> float:
         """Seconds between two scans."""
-        frames, seconds, _ = self.trajectory
-        return (
-            float(seconds[-1] - seconds[0]) / max(int(frames[-1] - frames[0]), 1)
-            or layout.FRAME_PERIOD_S
-        )
+        frames, seconds = [*self.seconds], [*self.seconds.values()]
+        step_s = (seconds[-1] - seconds[0]) / max(frames[-1] - frames[0], 1)
+        return step_s or layout.FRAME_PERIOD_S
 
 
 def match_grids(grids: Place, scans: Place, grid: str | None, frames: Frames) -> list[MatchedGrids]:
@@ -256,7 +254,7 @@ def _recording_of(
 
 
 def _match_frames(grids: GridFrames, scans: Sequence, chosen: FrameRange) -> MatchedGrids:
-    numbers, own, notes = grids.frames().tolist(), scans.frames("points"), list[str]()
+    numbers, own, notes = grids.frames().tolist(), scans.frames("points").tolist(), list[str]()
     height = _height_of(scans) if grids.benchmark == "occ3d-lidar" else 0.0
     if height is None:
         height = _HEIGHT_M
@@ -264,23 +262,17 @@ def _match_frames(grids: GridFrames, scans: Sequence, chosen: FrameRange) -> Mat
     result = MatchedGrids(grids, scans, (), (), (), height)
     _ = result.spec  # raises now, before work begins, if the geometry is unknown
     if not isinstance(grids, TokenFrames):
-        pairs = [(number, number) for number in numbers if number in set(own.tolist())]
+        pairs = [(number, number) for number in numbers if number in set(own)]
     elif (times := _token_times(grids)) is not None:
-        seconds = result.trajectory[1]
-        timed = [
-            (number, times[grids.name_of(number)])
-            for number in numbers
-            if grids.name_of(number) in times
-        ]
-        nearest = [(number, int(np.abs(seconds - t).argmin()), t) for number, t in timed]
-        pairs = [
-            (number, int(own[row]))
-            for number, row, t in nearest
-            if abs(seconds[row] - t) <= _SAME_TIME_S
-        ]
+        seconds, pairs = np.array([*result.seconds.values()]), []
+        for number in numbers:
+            if (time := times.get(grids.name_of(number))) is not None:
+                apart = np.abs(seconds - time)
+                if apart.min() <= _SAME_TIME_S:
+                    pairs.append((number, own[int(apart.argmin())]))
     elif len(numbers) == len(own):
         notes.append("tokens have no times: they were matched to the scans in their order")
-        pairs = list(zip(numbers, own.tolist(), strict=True))
+        pairs = list(zip(numbers, own, strict=True))
     else:
         raise MissingDataError(
             result.pair,
@@ -294,19 +286,17 @@ def _match_frames(grids: GridFrames, scans: Sequence, chosen: FrameRange) -> Mat
         notes.append(f"{left_out}, without a scan of the same number or time: {names}")
     pairs = [pair for pair in pairs if pair[0] in chosen]
     if not pairs:
-        where = f"frames {own[0]} to {own[-1]}" if len(own) else "frames with scans"
-        shown = (
-            f"{grids.name_of(numbers[0])} to {grids.name_of(numbers[-1])}"
-            if numbers
-            else "no frame"
-        )
-        advice = "check the names of the files: no grid has the number or time of a scan"
+        where = f"frames {own[0]} to {own[-1]}" if own else "frames with scans"
+        ends = [grids.name_of(number) for number in (numbers[:1] + numbers[-1:])]
         raise MissingDataError(
-            result.pair, expected=f"grids of {where}", found=shown, advice=advice
+            result.pair,
+            expected=f"grids of {where}",
+            found=" to ".join(ends) or "no frame",
+            advice="check the names of the files: no grid has the number or time of a scan",
         )
     made = [scan for _, scan in pairs]
     step = max(int(np.bincount(np.diff(made)).argmax()), 1) if len(made) > 1 else 1
-    usual = [f for f in own.tolist() if made[0] <= f <= made[-1] and (f - made[0]) % step == 0]
+    usual = [f for f in own if made[0] <= f <= made[-1] and (f - made[0]) % step == 0]
     return MatchedGrids(
         grids, scans, tuple(pairs), tuple(sorted(set(usual) - set(made))), tuple(notes), height
     )
@@ -324,11 +314,8 @@ def _token_times(grids: TokenFrames) -> dict[str, float] | None:
                 return {token: float(seconds) for token, seconds in rows}
         if (file := place / "annotations.json").is_file():
             with reading(file, "timestamps of tokens"):
-                scene: Any = (
-                    parse_json(file.read_bytes(), str(file))
-                    .get("scene_infos", {})
-                    .get(folder.name, {})
-                )
+                scenes: Any = parse_json(file.read_bytes(), str(file)).get("scene_infos", {})
+                scene = scenes.get(folder.name, {})
                 return {token: float(entry["timestamp"]) / 1e6 for token, entry in scene.items()}
     return None
 
@@ -336,10 +323,9 @@ def _token_times(grids: TokenFrames) -> dict[str, float] | None:
 def _height_of(scans: Sequence) -> float | None:
     sensors = scans.metadata.extra.get("sensors")
     first = sensors[0] if isinstance(sensors, list) and sensors else None
-    height = first.get("height_m") if isinstance(first, dict) else None
-    return (
-        float(height) if isinstance(height, int | float) and not isinstance(height, bool) else None
-    )
+    height: Any = first.get("height_m") if isinstance(first, dict) else None
+    is_number = isinstance(height, int | float) and not isinstance(height, bool)
+    return float(height) if is_number else None
 
 
 def _mapping(

@@ -18,6 +18,9 @@ from carlasc.core.arrays import FloatArray, IntArray
 State = Literal["fault", "undetermined", "sound"]
 STATES: tuple[State, ...] = ("fault", "undetermined", "sound")  # worst first
 
+Share = tuple[float, float, float]
+"""A number, and the lower and upper end of its interval of 95 %."""
+
 
 @dataclass(frozen=True)
 class Verdict:
@@ -46,6 +49,25 @@ class Verdict:
     where: str
     advice: str = ""
     details: str = ""
+
+    @classmethod
+    def of(
+        cls,
+        where: str,
+        check: str,
+        state: State | bool,
+        text: str,
+        value: Share | float | None = None,
+        advice: str = "",
+        unit: str = "share",
+    ) -> Verdict:
+        """Return a verdict; True is a fault, and False is sound. Only a fault has advice.
+
+        A number without an interval was counted, not sampled.
+        """
+        named: State = state if isinstance(state, str) else "fault" if state else "sound"
+        share = value if isinstance(value, tuple) else (value, value, value)
+        return cls(check, named, *share, unit, text, where, advice if named == "fault" else "")
 
     def __str__(self) -> str:
         return f"{self.where}: {self.sentence}"
@@ -122,9 +144,6 @@ DRAWS = 300
 
 Sums = dict[str, IntArray]
 """Counts by name, each an array of its own shape; missing ones are 0."""
-
-Share = tuple[float, float, float]
-"""A number, and the lower and upper end of its interval of 95 %."""
 
 
 def add(sums: Sums, name: str, counts: object) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from carlasc.errors import (
     ArgumentError,
@@ -15,6 +15,7 @@ from carlasc.errors import (
     MissingDataError,
     count,
 )
+from carlasc.inspection.cards.card_tables import tables_of_card
 from carlasc.inspection.cards.croissant import croissant, vocabulary
 from carlasc.inspection.cards.facts import CardDetails, Facts, gather
 from carlasc.inspection.cards.licenses import license_given
@@ -28,6 +29,7 @@ from carlasc.storage.parquet.parquet_source import ParquetSource
 from carlasc.storage.protocol import Source
 
 README, CROISSANT, PICTURES = "README.md", "croissant.json", "images"
+_PICTURED: tuple[Literal["grid", "scan"], ...] = ("grid", "scan")
 _SIZE = (960, 540)  # of a picture, pixels
 
 
@@ -98,29 +100,27 @@ def card(
     """
     stated = None if about.license is None else license_given(about.license)
     opened = as_source(source)
-    given = opened if isinstance(source, Source) else source
-    place, folder = place_of(given, None if out is None else Path(out), about.url)
+    place, folder = place_of(source, None if out is None else Path(out), about.url)
     overwrite = _check_free(folder, overwrite, pictures)
     facts = gather(opened, stated, every, run)
     tables = tables_of(opened) if isinstance(opened, ParquetSource) else []
+    shown = list(tables_of_card(facts))
     made = say("simulated") if facts.simulated else ""
     made += say("converted", sources=", ".join(facts.citations)) if facts.citations else ""
-    sequences = count(len(facts.sequences), "sequence")
-    summary = say(
-        "summary", frames=count(facts.frames, "LiDAR frame"), sequences=sequences, made=made
-    )
+    frames, sequences = count(facts.frames, "LiDAR frame"), count(len(facts.sequences), "sequence")
+    summary = say("summary", frames=frames, sequences=sequences, made=made)
     details = replace(
         about,
         name=about.name or place.title,
         description=about.description or summary,
         published=about.published or datetime.datetime.now(datetime.UTC).date().isoformat(),
     )
-    write_output(folder / CROISSANT, croissant(facts, details, place, tables))
+    write_output(folder / CROISSANT, croissant(facts, details, place, tables, shown))
     drawn, notes = _draw(facts, folder, overwrite) if pictures else ([], [])
     if details.not_stated:
         notes.append(say("not_stated", names=", ".join(details.not_stated)))
-    shown = [(path.relative_to(folder).as_posix(), text) for path, text in drawn]
-    write_output(folder / README, readme(facts, details, place, tables, shown))
+    images = [(path.relative_to(folder).as_posix(), text) for path, text in drawn]
+    write_output(folder / README, readme(facts, details, place, tables, shown, images))
     return CardResult(
         folder,
         (folder / README, folder / CROISSANT, *(path for path, _ in drawn)),
@@ -140,17 +140,13 @@ def _check_free(folder: Path, overwrite: bool, pictures: bool) -> bool:
     """
     if folder.exists() and not folder.is_dir():
         raise ArgumentError("out", expected="a folder", found=f"the file {folder}")
-    if overwrite or (not (folder / README).exists() and _is_ours(folder / CROISSANT)):
-        return True
-    drawn = [folder / PICTURES / f"{what}.png" for what in ("grid", "scan")] if pictures else []
+    replaces = overwrite or (not (folder / README).exists() and _is_ours(folder / CROISSANT))
+    drawn = [folder / PICTURES / f"{what}.png" for what in _PICTURED] if pictures else []
     for path in (folder / README, folder / CROISSANT, *drawn):
-        if path.exists():
-            raise ConflictError(
-                path,
-                problem="exists already",
-                advice="choose another folder, or replace it with `overwrite=True`",
-            )
-    return False
+        if path.exists() and not replaces:
+            advice = "choose another folder, or replace it with `overwrite=True`"
+            raise ConflictError(path, problem="exists already", advice=advice)
+    return replaces
 
 
 def _is_ours(path: Path) -> bool:
@@ -169,7 +165,7 @@ def _draw(facts: Facts, folder: Path, overwrite: bool) -> tuple[list[tuple[Path,
     from carlasc.viewing import Scene, StyleOptions, render
 
     drawn, notes = [], []
-    for what in ("grid", "scan"):
+    for what in _PICTURED:
         for path, sequence in facts.sequences.items():
             grid = next(iter(sequence.grids), None) if what == "grid" else None
             field = "points" if what == "scan" else f"{grid}/labels"

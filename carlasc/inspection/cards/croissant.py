@@ -5,13 +5,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from carlasc.inspection.cards.card_tables import Table, settings_of, tables_of_card
+from carlasc.inspection.cards.card_tables import Table, settings_of
 from carlasc.inspection.cards.facts import CardDetails, Facts
 from carlasc.inspection.cards.places import Place, PublishedTable
 from carlasc.inspection.texts import read
@@ -32,9 +32,13 @@ def vocabulary() -> Json:
 
 
 def croissant(
-    facts: Facts, details: CardDetails, place: Place, tables: Sequence[PublishedTable]
+    facts: Facts,
+    details: CardDetails,
+    place: Place,
+    tables: Sequence[PublishedTable],
+    shown: Sequence[Table],
 ) -> bytes:
-    """Return the bytes of croissant.json."""
+    """Return the bytes of croissant.json, from the arguments of `readme`."""
     licenses = [license_.url for license_ in facts.licenses]
     version = f"{details.name}, version {details.version}, {details.published}"
     cited = ", ".join([*details.authors, version])
@@ -62,7 +66,7 @@ def croissant(
             if text
         ],
         "distribution": [*_files(facts, place, tables)],
-        "recordSet": [*map(_inline, tables_of_card(facts)), *map(_published, tables)],
+        "recordSet": [*map(_inline, shown), *map(_published, tables)],
     }
     known = {name: value for name, value in content.items() if value not in (None, [])}
     return (json.dumps(known, indent=2, ensure_ascii=False) + "\n").encode()
@@ -73,7 +77,7 @@ def _id(name: str) -> str:
     return quote(name, safe="/._-")
 
 
-def _files(facts: Facts, place: Place, tables: Sequence[PublishedTable]) -> Iterable[Json]:
+def _files(facts: Facts, place: Place, tables: Sequence[PublishedTable]) -> Iterator[Json]:
     """Yield the files: each whole file with its checksum, and sets of files by their patterns."""
     inside: Json = {}
     if place.repository:
@@ -81,12 +85,10 @@ def _files(facts: Facts, place: Place, tables: Sequence[PublishedTable]) -> Iter
         yield vocabulary()["repository"] | {"contentUrl": place.repository}
     sets: list[tuple[str, str, str, list[str]]] = []
     for table in tables:
+        meaning = f"The tables of {table.name}: {table.title}."
+        sets.append((table.name, meaning, _PARQUET, table.paths))
         for path in table.paths:
             yield _file_object(place, path, _PARQUET)
-        published = [place.published(path) for path in table.paths]
-        sets.append(
-            (table.name, f"The tables of {table.name}: {table.title}.", _PARQUET, published)
-        )
     if not tables and place.is_file:
         encoding = vocabulary()["encodings"].get(Path(place.name).suffix.lower(), _BYTES)
         yield _file_object(place, "", encoding)
@@ -94,16 +96,15 @@ def _files(facts: Facts, place: Place, tables: Sequence[PublishedTable]) -> Iter
         if place.local is not None:
             yield _file_object(place, "zarr.json", "application/json")
         meaning = "The chunks of a zarr store of version 3."
-        sets.append(("zarr", meaning, "application/vnd.zarr", [place.published("*")]))
+        sets.append(("zarr", meaning, "application/vnd.zarr", ["*"]))
     elif not tables:
         parts = dict.fromkeys(f"{g.name}/{part}" for g, _, _ in facts.grids for part in g.parts)
         for name in [*facts.fields, *parts]:
             entry = layout.field_named(name)
             encoding = "image/jpeg" if entry.kind == "picture" else _BYTES
-            pattern = place.published(f"*{entry.folder}/*{entry.suffix}")
+            pattern = f"*{entry.folder}/*{entry.suffix}"
             sets.append((name.replace("/", "_"), f"{entry.meaning}.", encoding, [pattern]))
-        for name, meaning, encoding, pattern in vocabulary()["documents"]:
-            sets.append((name, meaning, encoding, [place.published(pattern)]))
+        sets += vocabulary()["documents"]
     for name, meaning, encoding, includes in sets:
         yield {
             "@type": "cr:FileSet",
@@ -111,18 +112,20 @@ def _files(facts: Facts, place: Place, tables: Sequence[PublishedTable]) -> Iter
             "name": f"{name}-files",
             "description": meaning,
             "encodingFormat": encoding,
-            "includes": includes,
+            "includes": [place.published(path) for path in includes],
         } | inside
 
 
 def _file_object(place: Place, path: str, encoding: str) -> Json:
     """Return a file with its size and checksum."""
-    checksum, size = place.measure(path)
+    (checksum, size), published = place.measure(path), place.published(path)
     return {
         "@type": "cr:FileObject",
-        "@id": _id(place.published(path)),
-        "name": place.published(path).rpartition("/")[2],
-        "contentUrl": place.address(path),
+        "@id": _id(published),
+        "name": published.rpartition("/")[2],
+        "contentUrl": f"{place.repository}/resolve/main/{published}"
+        if place.repository
+        else published,
         "encodingFormat": encoding,
         "contentSize": f"{size} B",
         "sha256": checksum,
@@ -154,12 +157,9 @@ def _inline(table: Table) -> Json:
     name, kinds = _id(table.name), {str: "sc:Text", int: "sc:Integer"}
     fields = {
         column: {"dataType": kinds.get(type(value), "sc:Float")}
-        for column, value in zip(table.columns, table.rows[0], strict=True)
+        for column, value in table.rows[0].items()
     }
-    records = [
-        {f"{name}/{column}": value for column, value in zip(table.columns, row, strict=True)}
-        for row in table.rows
-    ]
+    records = [{f"{name}/{column}": row[column] for column in row} for row in table.rows]
     return _record_set(name, table.title, fields, data=records)
 
 

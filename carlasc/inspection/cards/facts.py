@@ -62,27 +62,26 @@ class CardDetails:
     published: str | None = None
 
     def __post_init__(self) -> None:
-        if not re.fullmatch(r"\d+(\.\d+){0,2}([-+][0-9A-Za-z.-]+)?", self.version):
-            raise ArgumentError(
-                "version", expected="a version such as 1.0.0", found=repr(self.version)
-            )
+        version, address = r"\d+(\.\d+){0,2}([-+][0-9A-Za-z.-]+)?", r"https?://[^\s\"'<>]+"
         try:
-            datetime.date.fromisoformat(self.published or "2000-01-01")
+            is_date = bool(datetime.date.fromisoformat(self.published or "2000-01-01"))
         except ValueError:
-            raise ArgumentError(
-                "published", expected="a date YYYY-MM-DD", found=repr(self.published)
-            ) from None
-        if self.url is not None and not re.fullmatch(r"https?://[^\s\"'<>]+", self.url):
-            raise ArgumentError(
-                "url", expected="an address that begins with https://", found=repr(self.url)
-            )
+            is_date = False
+        for name, is_valid, expected in (
+            ("version", re.fullmatch(version, self.version), "a version such as 1.0.0"),
+            ("published", is_date, "a date YYYY-MM-DD"),
+            (
+                "url",
+                self.url is None or re.fullmatch(address, self.url),
+                "an address that begins with https://",
+            ),
+        ):
+            if not is_valid:
+                raise ArgumentError(name, expected=expected, found=repr(getattr(self, name)))
         for name, text in self.statements.items():
             if name not in STATEMENTS or not isinstance(text, str):
-                raise ArgumentError(
-                    "statements",
-                    expected=f"a text for some of {', '.join(STATEMENTS)}",
-                    found=f"{name} = {text!r}",
-                )
+                expected = f"a text for some of {', '.join(STATEMENTS)}"
+                raise ArgumentError("statements", expected=expected, found=f"{name} = {text!r}")
 
     @property
     def not_stated(self) -> list[str]:
@@ -121,9 +120,7 @@ class Facts:
     @cached_property
     def fields(self) -> dict[str, int]:
         """Number of frames of each field, without the fields of grids."""
-        counts: Counter[str] = Counter()
-        for sequence in self.overview.sequences:
-            counts.update(sequence.fields)
+        counts = sum((Counter(one.fields) for one in self.overview.sequences), Counter[str]())
         return dict(sorted(counts.items()))
 
     @cached_property
@@ -188,10 +185,9 @@ class Facts:
             if report.inferred_share:
                 yield say("inferred", share=f"{report.inferred_share:.1%}", grid=name)
         for near, far in sorted({(m.min_range_m, m.max_range_m) for m in self.metadata}, key=str):
-            limits = [f"nearer than {near:g} m"] if near else []
-            limits += [f"farther than {far:g} m"] if far else []
-            if limits:
-                yield say("ranges", limits=" or ".join(limits))
+            limits = {"nearer": near, "farther": far}
+            if shown := [f"{how} than {limit:g} m" for how, limit in limits.items() if limit]:
+                yield say("ranges", limits=" or ".join(shown))
         if self.lossy_mm:
             yield say("rounded", step=f"{self.lossy_mm:g}")
         if self.every > 1:
@@ -210,16 +206,12 @@ def gather(source: Source, license_: License | None, every: int, run: Run) -> Fa
         raise ArgumentError("every", expected="1 or more", found=str(every))
     sequences = {path: one for path, one in source.sequences().items() if one.fields()}
     if not sequences:
-        raise MissingDataError(
-            source.location,
-            expected="sequences",
-            found="none",
-            advice="make them with `carlasc regrid`",
-        )
+        advice = "make them with `carlasc regrid`"
+        raise MissingDataError(source.location, expected="sequences", found="none", advice=advice)
     parts = licensed_parts(sequences.values(), license_, source.location)
     overview = info(source)
     tables: dict[str, dict[str, StoredSequence]] = {}
-    reports = {}
+    reports, counted = {}, []
     for one in overview.sequences:
         # A grid that cannot be described would be missing from the card without a message.
         if one.problem:
@@ -230,7 +222,6 @@ def gather(source: Source, license_: License | None, every: int, run: Run) -> Fa
                 reports[f"{path}/{grid}".lstrip("/")] = report
         if any(name.rpartition("/")[2] == "labels" for name in sequence.fields()):
             tables.setdefault(sequence.metadata.classes.name, {})[path] = sequence
-    counted = []
     for chosen in tables.values():
         with suppress(MissingDataError):  # several grids without the published one
             one_table = ChosenSequences(source.location, chosen)

@@ -13,6 +13,7 @@ from carlasc.inspection.texts import read_table
 from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence
 
+_SCHEME = r"^https?://(?:www\.)?"
 _OTHER = "other"  # name at the Hugging Face Hub for all licences that it does not list
 
 
@@ -41,26 +42,18 @@ class License:
         """Its conditions, in words."""
         if self.derivatives is None:
             return "read its text"
-        demands = [
-            text
-            for text, holds in (
-                ("name the authors", self.name.startswith(("CC BY", "ODC-BY"))),
-                ("non-commercial use only", not self.commercial),
-                ("the same licence for derived data", self.share_alike),
-                ("no publication of derived data", not self.derivatives),
-            )
-            if holds
-        ]
-        return ", ".join(demands) or "any use"
+        demands = {
+            "name the authors": self.name.startswith(("CC BY", "ODC-BY")),
+            "non-commercial use only": not self.commercial,
+            "the same licence for derived data": self.share_alike,
+            "no publication of derived data": not self.derivatives,
+        }
+        return ", ".join(text for text, holds in demands.items() if holds) or "any use"
 
     @property
-    def strictness(self) -> tuple[bool, bool, bool]:
+    def strictness(self) -> tuple[bool, ...]:
         """A key by which stricter licences sort last."""
-        return (
-            self.derivatives is not True,
-            self.commercial is not True,
-            self.share_alike is not False,
-        )
+        return (not self.derivatives, not self.commercial, self.share_alike is not False)
 
 
 @cache
@@ -74,32 +67,32 @@ def _licenses() -> dict[str, License]:
             hub = f"cc-{kind}-{version}" if version in on_hub else _OTHER
             permits = ("nd" not in kind, "nc" not in kind, "sa" in kind)
             licenses.append(License(f"CC {kind.upper()} {version}", url, hub, *permits))
-    return {re.sub(r"[^a-z0-9.]+", "-", one.name.lower()): one for one in licenses}
+    return {_key(one.name.lower()): one for one in licenses}
 
 
 def find_license(text: str) -> License | None:
     """Return the licence of a name such as "CC BY 4.0" or "cc-by-4.0", or of the address of a
     licence's text; None for another text.
     """
-    stripped = text.strip()
+    stripped, licenses = text.strip(), _licenses()
     if re.fullmatch(r"https?://[^\s\"'<>]+", stripped):
-        if deed := re.match(
-            r"https?://(?:www\.)?creativecommons\.org/licenses/([a-z-]+)/(\d\.\d)\b", stripped
-        ):
-            # /deed.en, /legalcode or a country may follow
-            return _licenses().get(f"cc-{deed[1]}-{deed[2]}")
-        address = re.sub(r"^https?://(www\.)?", "", stripped).rstrip("/")
-        known = (
-            one
-            for one in _licenses().values()
-            if re.sub(r"^https://(www\.)?", "", one.url).rstrip("/") == address
-        )
+        # a deed, /legalcode or a country may follow the address of a licence of Creative Commons
+        common = r"creativecommons\.org/licenses/([a-z-]+)/(\d\.\d)\b"
+        if deed := re.match(_SCHEME + common, stripped):
+            return licenses.get(f"cc-{deed[1]}-{deed[2]}")
+        known = (one for one in licenses.values() if _address(one.url) == _address(stripped))
         return next(known, License(stripped, stripped, _OTHER, None, None, None))
-    key = re.sub(
-        r"\blicen[cs]e\b|\bv(?=\d)", "", stripped.lower().replace("creative commons", "cc")
-    )
-    key = re.sub(r"[^a-z0-9.]+", "-", key).strip("-")
-    return _licenses().get(read_table("licenses.toml")["short"].get(key, key))
+    name = stripped.lower().replace("creative commons", "cc")
+    key = _key(re.sub(r"\blicen[cs]e\b|\bv(?=\d)", "", name))
+    return licenses.get(read_table("licenses.toml")["short"].get(key, key))
+
+
+def _address(url: str) -> str:
+    return re.sub(_SCHEME, "", url).rstrip("/")
+
+
+def _key(name: str) -> str:
+    return re.sub(r"[^a-z0-9.]+", "-", name).strip("-")
 
 
 def license_given(text: str) -> License:
@@ -110,13 +103,12 @@ def license_given(text: str) -> License:
     """
     license_ = find_license(text)
     if license_ is None:
-        near = difflib.get_close_matches(
-            text.lower(), [one.hub for one in _licenses().values()], 3, 0.5
-        )
+        names = [one.hub for one in _licenses().values()]
+        near = difflib.get_close_matches(text.lower(), names, 3, 0.5)
+        near = near or ["cc-by-4.0", "cc-by-nc-sa-4.0", "mit"]
         raise ArgumentError(
             "license",
-            expected=f"the name of a licence, such as "
-            f"{', '.join(near or ['cc-by-4.0', 'cc-by-nc-sa-4.0', 'mit'])}",
+            expected=f"the name of a licence, such as {', '.join(near)}",
             found=repr(text),
             advice="for another licence, give the address of its text (https://...)",
         )
@@ -172,31 +164,28 @@ def licensed_parts(
                 "own copies",
             )
         paths_of.setdefault((source, license_), []).append(sequence.path)
-    known = {license_ for _, license_ in paths_of if license_ is not None}
-    without = sorted({source or "" for source, license_ in paths_of if license_ is None})
-    if without and given is None:
-        of = " and ".join(source for source in without if source)
-        raise ArgumentError(
-            "license",
-            expected=f"the licence of {of}" if of else "the licence of these data",
-            found=f"none given, and none in {layout.METADATA} of {location}",
-            advice="name it with `license`, such as cc-by-4.0",
-        )
-    if given is not None and not without and given not in known:
-        raise ArgumentError(
-            "license",
-            expected=f"{', '.join(sorted(one.name for one in known))}, the licence of the source, "
-            f"which also holds for data that are made from it",
-            found=given.name,
-        )
     parts = []
     for (source, license_), paths in paths_of.items():
-        holds = given if license_ is None else license_
-        assert holds is not None  # checked above
+        holds = license_ or given
+        if holds is None:
+            without = sorted({source for source, license_ in paths_of if source and not license_})
+            raise ArgumentError(
+                "license",
+                expected=f"the licence of {' and '.join(without) or 'these data'}",
+                found=f"none given, and none in {layout.METADATA} of {location}",
+                advice="name it with `license`, such as cc-by-4.0",
+            )
         parts.append(LicensedPart(source, holds, license_ is None, tuple(paths)))
-    return tuple(
-        sorted(parts, key=lambda part: (part.license.strictness, part.source or ""), reverse=True)
-    )
+    if given is not None and all(part.license != given for part in parts):
+        names = sorted({part.license.name for part in parts})
+        raise ArgumentError(
+            "license",
+            expected=f"{', '.join(names)}, the licence of the source, which also holds for data "
+            "that are made from it",
+            found=given.name,
+        )
+    parts.sort(key=lambda part: (part.license.strictness, part.source or ""), reverse=True)
+    return tuple(parts)
 
 
 def _license_of(sequence: Sequence) -> License | None:

@@ -119,13 +119,6 @@ class Place:
         """Return the path of a file of the data below the folder of the card."""
         return str(PurePosixPath(self.name) / path) if self.name or path else ""
 
-    def address(self, path: str) -> str:
-        """Return the address of a file: its URL if that is known, otherwise its path below the
-        folder of the card.
-        """
-        published = self.published(path)
-        return f"{self.repository}/resolve/main/{published}" if self.repository else published
-
     def measure(self, path: str) -> tuple[str, int]:
         """Return the SHA-256 of a file, 64 hexadecimal digits, and its bytes."""
         if self.local is None:

@@ -13,18 +13,18 @@ from collections.abc import Sequence
 from typing import Any
 
 from carlasc.errors import count, printable
-from carlasc.inspection.cards.card_tables import Table, tables_of_card
+from carlasc.inspection.cards.card_tables import Table
 from carlasc.inspection.cards.facts import STATEMENTS, CardDetails, Facts
 from carlasc.inspection.cards.places import Place, PublishedTable
 from carlasc.inspection.texts import fill, say
 
-_SIZES = (
-    (1_000, "n<1K"),
-    (10_000, "1K<n<10K"),
-    (100_000, "10K<n<100K"),
-    (1_000_000, "100K<n<1M"),
-    (10**7, "1M<n<10M"),
-)
+_SIZES = {
+    "n<1K": 10**3,
+    "1K<n<10K": 10**4,
+    "10K<n<100K": 10**5,
+    "100K<n<1M": 10**6,
+    "1M<n<10M": 10**7,
+}
 _TAGS = (
     "croissant carlasc lidar 3d voxel-grid semantic-scene-completion occupancy-prediction "
     "autonomous-driving"
@@ -37,6 +37,7 @@ def readme(
     details: CardDetails,
     place: Place,
     tables: Sequence[PublishedTable],
+    shown: Sequence[Table],
     pictures: Sequence[tuple[str, str]],
 ) -> bytes:
     """Return the bytes of README.md.
@@ -46,9 +47,9 @@ def readme(
         details: what is not in the data; with a name, a description and a date.
         place: the location of the data.
         tables: the tables of a Parquet store.
+        shown: the tables of the card.
         pictures: (path below the folder of the card, content) of each picture.
     """
-    rows = list(tables_of_card(facts))
     drawn = [f"![{_text(caption)}]({path})" for path, caption in pictures]
     stated = [f"### {STATEMENTS[name]}\n\n{text}" for name, text in details.statements.items()]
     if details.not_stated:
@@ -60,7 +61,7 @@ def readme(
         opening="\n\n".join([_text(details.description or ""), *drawn]),
         glance=_glance(facts, details),
         reading=_opening(facts, place, tables),
-        **{name: _section(rows, name) for name in ("classes", "sequences", "grids", "licenses")},
+        **{name: _section(shown, name) for name in ("classes", "sequences", "grids", "licenses")},
         statements="\n\n".join(stated),
         limits="\n".join(f"- {_text(limit)}" for limit in facts.limits()) or "None.",
         citation=_citation(facts, details),
@@ -75,12 +76,14 @@ def _front_matter(
     if others := [license_ for license_ in facts.licenses if license_.hub == "other"]:
         values["license_name"] = re.sub(r"[^a-z0-9.]+", "-", others[0].name.lower()).strip("-")
         values["license_link"] = others[0].url
-    optional = {"scene-flow": "flow" in facts.fields, "simulation": facts.simulated}
+    tags = {"scene-flow": "flow" in facts.fields, "simulation": facts.simulated}
     values |= {
         "pretty_name": details.name,
         "task_categories": ["other"],
-        "size_categories": [next((name for most, name in _SIZES if facts.frames < most), "n>10M")],
-        "tags": [*_TAGS, *(tag for tag, holds in optional.items() if holds)],
+        "size_categories": [
+            next((name for name, most in _SIZES.items() if facts.frames < most), "n>10M")
+        ],
+        "tags": [*_TAGS, *(tag for tag, holds in tags.items() if holds)],
     }
     if tables:
         values["configs"] = [
@@ -164,11 +167,11 @@ def _opening(facts: Facts, place: Place, tables: Sequence[PublishedTable]) -> st
 
 def _section(tables: Sequence[Table], name: str) -> str:
     text = []
-    for table in tables:
-        if table.section == name:
-            text += [_text(table.title), _table(table.columns, table.rows[:_MOST_ROWS])]
-            if len(table.rows) > _MOST_ROWS:
-                text.append(say("more_rows", count=len(table.rows) - _MOST_ROWS))
+    for _, _, title, rows in (table for table in tables if table.section == name):
+        shown = [list(row.values()) for row in rows[:_MOST_ROWS]]
+        text += [_text(title), _table([*rows[0]], shown)]
+        if len(rows) > _MOST_ROWS:
+            text.append(say("more_rows", count=len(rows) - _MOST_ROWS))
     return "\n\n".join(text) or "None."
 
 
@@ -203,6 +206,6 @@ def _text(text: str) -> str:
     heading.
     """
     shown = printable(" ".join(text.split()))
-    return (
-        re.sub(r"([\\`*_\[\]<>])", r"\\\1", shown) if re.search(r"[`*\[\]<>\\]", shown) else shown
-    )
+    if re.search(r"[`*\[\]<>\\]", shown):
+        return re.sub(r"([\\`*_\[\]<>])", r"\\\1", shown)
+    return shown
