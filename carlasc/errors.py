@@ -1,4 +1,4 @@
-"""The exceptions of carlasc, helpers for messages, the check for optional packages, and postponed
+"""The exceptions of carlasc, helpers for messages, optional packages and plugins, and postponed
 Ctrl-C.
 
 Every message is one line: where (a file, a field, an argument), what was expected, what was found,
@@ -301,3 +301,39 @@ def first_names(names: Iterable[str], most: int = 8) -> str:
     """Return the first `most` names, separated by commas, and the number of further names."""
     names = list(names)
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def plugin_names(group: str) -> tuple[str, ...]:
+    """Return the sorted names in an entry-point group, without loading any."""
+    from importlib.metadata import entry_points  # slow, and few commands need it
+
+    return tuple(sorted({entry.name for entry in entry_points(group=group)}))
+
+
+def load_plugin(group: str, name: str, base: type | None = None) -> Any:
+    """Load what an entry point names.
+
+    Args:
+        group: an entry-point group, such as "carlasc.converters".
+        name: name of the entry point.
+        base: the class that it must inherit; None if it may be anything.
+
+    Raises:
+        ArgumentError: the group has no such name.
+        DependencyError: it cannot be loaded, or does not inherit `base`.
+    """
+    from importlib.metadata import entry_points
+
+    entries = {entry.name: entry for entry in entry_points(group=group)}
+    if name not in entries:
+        expected = f"one of {', '.join(sorted(entries)) or 'no names: none is installed'}"
+        raise ArgumentError("name", expected=expected, found=repr(name))
+    where = f"{group.removeprefix('carlasc.').removesuffix('s')} {name} ({entries[name].value})"
+    try:
+        plugin = entries[name].load()
+    except Exception as error:  # code of another distribution may fail in any way
+        raise DependencyError(where, problem=f"cannot be loaded: {error}") from error
+    if base is not None and not (isinstance(plugin, type) and issubclass(plugin, base)):
+        public = ".".join([*base.__module__.split(".")[:2], base.__name__])
+        raise DependencyError(where, expected=f"a class that inherits {public}", found=repr(plugin))
+    return plugin

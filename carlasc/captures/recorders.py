@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from carlasc.core.plugins import load_plugin, plugin_names
+from carlasc.errors import load_plugin, plugin_names
 
 if TYPE_CHECKING:
     from carlasc_recorders.carla.recording import record as record  # noqa: PLC0414

@@ -30,7 +30,7 @@ from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage.camera_files import cameras_to_json
 from carlasc.storage.files import AnyPath
 from carlasc.storage.layout import CAMERAS, FRAME_PERIOD_S
-from carlasc.storage.transport.targets import check_shared
+from carlasc.storage.transport.remote_tree import check_shared
 
 SETTINGS_FILE = "simulation.json"
 TOWN = "town"

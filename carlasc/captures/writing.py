@@ -25,7 +25,8 @@ from carlasc.core.geometry import check_rigid
 from carlasc.errors import ConflictError, FormatError
 from carlasc.storage.files import AnyPath, has_content, parse_json, remove_stale, to_json
 from carlasc.storage.layout import FRAME_PERIOD_S
-from carlasc.storage.transport.targets import LocalTarget, Target, target_of
+from carlasc.storage.transport.remote_tree import target_of
+from carlasc.storage.transport.trees import LocalTarget, Target
 
 
 class CaptureWriter:

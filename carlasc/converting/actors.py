@@ -51,7 +51,7 @@ from carlasc.motion import Segment, Track, ground_points, segment_by_boxes
 from carlasc.motion.paths import estimate_path, is_static
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
-from carlasc.storage.sinks import SequenceWriter
+from carlasc.storage.protocol import SequenceWriter
 
 Fields = Mapping[str, AnyArray]
 """Arrays of a frame by the names of their fields, in the order in which they are written."""

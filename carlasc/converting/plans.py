@@ -22,17 +22,16 @@ from carlasc.core.frames import check_seconds
 from carlasc.core.geometry import invert, mirror_poses, relative_to
 from carlasc.core.grids import GridSpec, mirror_spec
 from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError
-from carlasc.inspection.alignment import diagnose_poses
+from carlasc.inspection.alignment import diagnose_poses, structure_of
 from carlasc.inspection.pose_quality import describe_mounting
-from carlasc.inspection.structure import structure_of
 from carlasc.motion.options import PoseOptions
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
 from carlasc.storage.metadata import Metadata
+from carlasc.storage.protocol import SequenceWriter, Sink
 from carlasc.storage.resuming import agree_lines, agree_metadata, check_grid
-from carlasc.storage.sinks import SequenceWriter, Sink
 
 if TYPE_CHECKING:
     from carlasc.motion.odometry import UsableScan

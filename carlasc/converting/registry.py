@@ -20,7 +20,6 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from carlasc.converting.exporter import Exporter
 from carlasc.converting.protocol import Converter, Recording
 from carlasc.core.classes import ClassTable, Remap
-from carlasc.core.plugins import load_plugin, plugin_names
 from carlasc.core.tables import CARLA, remaps_between
 from carlasc.errors import (
     ArgumentError,
@@ -28,6 +27,8 @@ from carlasc.errors import (
     DependencyError,
     MissingDataError,
     check_choice,
+    load_plugin,
+    plugin_names,
 )
 from carlasc.storage.opening import as_source
 

@@ -22,7 +22,7 @@ from carlasc.converting.stages import Conversion
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError, check_choice
 from carlasc.groundtruth.options import FromScans, GridOptions, Voting, fit_to_ground
-from carlasc.groundtruth.run import RegridResult, regrid
+from carlasc.groundtruth.run import regrid
 from carlasc.motion.ground import Ground, joined
 from carlasc.motion.options import PoseOptions
 from carlasc.running.processes import one_pool
@@ -30,9 +30,9 @@ from carlasc.running.spreading import Part, Run, StepCounter
 from carlasc.storage.files import AnyPath
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.opening import as_sink
-from carlasc.storage.protocol import Sequence, Source
-from carlasc.storage.sinks import Sink
-from carlasc.storage.transport.targets import LocalTarget, check_shared
+from carlasc.storage.protocol import Sequence, Sink, Source
+from carlasc.storage.transport.remote_tree import check_shared
+from carlasc.storage.transport.trees import LocalTarget
 
 Grids = GridOptions | Literal["voxels"] | None
 _LOOKED_AT = (
@@ -155,14 +155,14 @@ def convert(
             sink.finish(incomplete=True)  # missing frames could not be read, and are reported
         made = None
         if isinstance(grids, GridOptions):
-            made = _make_grids(
-                conversions,
-                grids,
-                sink,
-                out,
-                poses,
-                replace(pooled, part=Part(), progress=steps.stage()),
-            )
+            alone = replace(pooled, part=Part(), progress=steps.stage())
+            converted = [conversion for conversion in conversions if conversion.has_scans]
+            if converted:  # otherwise every frame failed, and is reported
+                scans = _ConvertedScans(sink, converted)
+                spec, observe, cut = _plan_grids(grids, converted, scans, poses)
+                voting = grids.voting or Voting()
+                made = regrid(scans, spec, out, observe=observe, voting=voting, run=alone)
+                made = replace(made, notes=(*cut, *made.notes))
 
     failures = [failure for conversion in conversions for failure in conversion.failures]
     notes = [note for conversion in conversions for note in conversion.notes]
@@ -195,35 +195,24 @@ class _ConvertedScans(Source):
         }
 
 
-def _make_grids(
-    conversions: Series[Conversion],
-    grids: GridOptions,
-    sink: Sink,
-    out: AnyPath | Sink,
-    poses: PoseOptions,
-    run: Run,
-) -> RegridResult | None:
-    """Make grids of the converted sequences; None if no scan was converted.
+def _plan_grids(
+    grids: GridOptions, conversions: Series[Conversion], scans: Source, poses: PoseOptions
+) -> tuple[GridSpec, FromScans, list[str]]:
+    """Return the grid of the converted sequences, how scans are merged, and notes for the user.
 
     All grids have the same bounds, so that they can be in one training set: the bounds of the
     options, moved to the height of the ground if `follow_ground` is set.
     """
-    conversions = [conversion for conversion in conversions if conversion.has_scans]
-    if not conversions:
-        return None  # every frame failed, and is reported
     spec, notes = grids.spec or GridSpec.published(), list[str]()
     if grids.follow_ground:
         spec, notes = _fit(
-            spec, [one.ground for one in conversions if one.ground is not None], sink.location
+            spec, [one.ground for one in conversions if one.ground is not None], scans.location
         )
     observe = replace(
         grids.observe if isinstance(grids.observe, FromScans) else FromScans(),
         poses=replace(poses, source="file"),
     )
-    voting, scans = grids.voting or Voting(), _ConvertedScans(sink, conversions)
-    notes += _what_is_cut(spec, scans)
-    result = regrid(scans, spec, out, observe=observe, voting=voting, run=run)
-    return replace(result, notes=(*notes, *result.notes))
+    return spec, observe, notes + _what_is_cut(spec, scans)
 
 
 def _fit(spec: GridSpec, grounds: Series[Ground], where: str) -> tuple[GridSpec, list[str]]:

@@ -59,7 +59,7 @@ from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.camera_files import cameras_to_json
 from carlasc.storage.metadata import Metadata
-from carlasc.storage.sinks import SequenceWriter
+from carlasc.storage.protocol import SequenceWriter
 
 VOXEL_FILES = "voxels_kitti"
 """Folder of a sequence with the unchanged voxel files of the other data set, so that an export can
@@ -339,7 +339,7 @@ class Conversion:
         """Yield the frames that were read with their poses, which are estimated if they are not
         known.
         """
-        usable = (result for result in results if result.failure is None)
+        usable = filter(lambda result: result.failure is None, results)
         if self.plan.poses is not None:
             for result in usable:
                 yield result, self.plan.poses[result.number]

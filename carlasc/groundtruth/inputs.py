@@ -28,8 +28,7 @@ from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.camera_files import cameras_of, scan_T_camera
 from carlasc.storage.metadata import Metadata
-from carlasc.storage.protocol import Sequence
-from carlasc.storage.sinks import SequenceWriter
+from carlasc.storage.protocol import Sequence, SequenceWriter
 
 if TYPE_CHECKING:
     from carlasc.groundtruth.seen import Views

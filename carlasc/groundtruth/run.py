@@ -43,7 +43,7 @@ from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath, parse_json, to_json
 from carlasc.storage.opening import as_sink
-from carlasc.storage.protocol import Source
+from carlasc.storage.protocol import SequenceWriter, Sink, Source
 from carlasc.storage.resuming import (
     RECORD,
     RECORD_FORMAT,
@@ -53,8 +53,7 @@ from carlasc.storage.resuming import (
     check_name,
     check_scan,
 )
-from carlasc.storage.sinks import SequenceWriter, Sink
-from carlasc.storage.transport.targets import check_shared
+from carlasc.storage.transport.remote_tree import check_shared
 from carlasc.storage.transport.trees import is_url
 
 RULES = {"capture": 1, "scans": 3, "grid": 1}

@@ -20,7 +20,7 @@ from carlasc.errors import ArgumentError, CarlascError, MissingDataError
 from carlasc.groundtruth import FrameFailure, FromScans, Voting
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import merge_frame
-from carlasc.groundtruth.from_scans.motion_pass import find_actors
+from carlasc.groundtruth.from_scans.motion_pass import find_actors, refine_sequence
 from carlasc.groundtruth.from_scans.sequences import (
     ScanFrame,
     ScanSequence,
@@ -140,7 +140,8 @@ def holdout(
     steps(0)
     for row, sequence in enumerate(inputs):
         given = sequence.feed
-        sequence.refine(None, run, steps)
+        if sequence.refines:
+            sequence.use_refined(refine_sequence(given, None, run, steps))
         if sequence.feed is not given:
             steps.expect(drives[row].steps)
             drives.append(replace(drives[row], is_used=False))

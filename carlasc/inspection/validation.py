@@ -19,7 +19,7 @@ from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.reporting import Report, digest_of, short
 from carlasc.inspection.agreement import GridDiagnosis, GridEvidence, GroundBelow, check_actors
-from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses
+from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses, static_structure
 from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values
 from carlasc.inspection.findings import (
     SEVERITIES,
@@ -30,7 +30,6 @@ from carlasc.inspection.findings import (
 )
 from carlasc.inspection.image_alignment import compare_images, judge_images
 from carlasc.inspection.pose_quality import check_poses, check_times, describe_mounting
-from carlasc.inspection.structure import static_structure
 from carlasc.motion.ground import ground_of
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter

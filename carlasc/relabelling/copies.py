@@ -20,8 +20,7 @@ from carlasc.storage import layout
 from carlasc.storage.derived_copies import CopyResult, DerivedCopy, DerivedSequence
 from carlasc.storage.files import AnyPath
 from carlasc.storage.metadata import PREDICTED
-from carlasc.storage.protocol import Sequence, Source
-from carlasc.storage.sinks import SequenceWriter
+from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 
 PREDICTED_FIELDS = ("labels", "probabilities")
 """The fields of predicted labels."""

@@ -59,8 +59,7 @@ from carlasc.storage.camera_files import (
 )
 from carlasc.storage.derived_copies import sequences_with_scans
 from carlasc.storage.files import AnyPath
-from carlasc.storage.protocol import Sequence, Source
-from carlasc.storage.sinks import SequenceWriter
+from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 
 _SUFFIXES = (".png", ".npy")
 _FIELD = "image_labels"  # of the layout

@@ -30,8 +30,7 @@ from carlasc.storage.derived_copies import (
     sequences_with_scans,
 )
 from carlasc.storage.files import AnyPath
-from carlasc.storage.protocol import Sequence, Source
-from carlasc.storage.sinks import SequenceWriter
+from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 
 _WRITTEN = ("flow", "instances")
 _FOUND = "found by carlasc from "  # words of carlasc.json about motion, before its source

@@ -39,8 +39,7 @@ from carlasc.storage.derived_copies import (
 )
 from carlasc.storage.files import AnyPath
 from carlasc.storage.metadata import Metadata
-from carlasc.storage.protocol import Sequence, Source
-from carlasc.storage.sinks import SequenceWriter
+from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 
 _RUN = 60  # number of scans in a run, for the mounting of the sensor
 # words for poses in carlasc.json

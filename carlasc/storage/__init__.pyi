@@ -11,8 +11,8 @@ from .opening import as_source as as_source
 from .opening import open as open
 from .packing import pack as pack
 from .protocol import Sequence as Sequence
+from .protocol import SequenceWriter as SequenceWriter
+from .protocol import Sink as Sink
 from .protocol import Source as Source
-from .sinks import SequenceWriter as SequenceWriter
-from .sinks import Sink as Sink
 from .transport.caching import Cache as Cache
 from .zarr.zarr_finish import finish as finish

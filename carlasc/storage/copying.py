@@ -24,9 +24,8 @@ from carlasc.storage.files import AnyPath, unfinished
 from carlasc.storage.folder import FolderSink
 from carlasc.storage.opening import as_source
 from carlasc.storage.packed.output import put_in_place
-from carlasc.storage.protocol import Sequence, Source
-from carlasc.storage.sinks import SequenceWriter
-from carlasc.storage.transport.targets import check_shared
+from carlasc.storage.protocol import Sequence, SequenceWriter, Source
+from carlasc.storage.transport.remote_tree import check_shared
 from carlasc.storage.transport.trees import is_url
 
 Progress = Callable[[int, int], None]

@@ -37,8 +37,7 @@ from carlasc.storage.files import (
 from carlasc.storage.folder import FolderSequence, FolderSink, FolderSource
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.packed.output import remove
-from carlasc.storage.protocol import Sequence, Source
-from carlasc.storage.sinks import SequenceWriter
+from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 from carlasc.storage.transport.trees import is_url
 from carlasc.storage.views import ChosenSequences, SequenceView
 

@@ -14,11 +14,10 @@ from carlasc.core.arrays import AnyArray
 from carlasc.errors import MissingDataError
 from carlasc.storage import field_files, layout
 from carlasc.storage.files import AnyPath, remove_stale
-from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.protocol import FrameArrays, Sequence, SequenceWriter, Sink, Source
 from carlasc.storage.published import PublishedSequence, PublishedSource
-from carlasc.storage.sinks import FrameArrays, SequenceWriter, Sink
-from carlasc.storage.transport.targets import LocalTarget, Target, target_of
-from carlasc.storage.transport.trees import LocalTree
+from carlasc.storage.transport.remote_tree import target_of
+from carlasc.storage.transport.trees import LocalTarget, LocalTree, Target
 
 # end record of a zip without a comment, as NumPy writes it
 _ZIP_END, _ZIP_END_BYTES = (

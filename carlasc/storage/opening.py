@@ -12,14 +12,12 @@ from carlasc.storage.files import AnyPath, damaged, unfinished
 from carlasc.storage.folder import FolderSink, FolderSource
 from carlasc.storage.packed.output import TABLES_MARK, UNFINISHED_MARK, unfinished_error
 from carlasc.storage.packed.stores import PackedSink, PackOptions
-from carlasc.storage.protocol import Source
+from carlasc.storage.protocol import Sink, Source
 from carlasc.storage.published import PublishedSource
-from carlasc.storage.sinks import Sink
 from carlasc.storage.transport.caching import Cache, CachedTree
 from carlasc.storage.transport.clients import HUB
-from carlasc.storage.transport.remote_tree import RemoteTree
-from carlasc.storage.transport.targets import Target, target_of
-from carlasc.storage.transport.trees import LocalTree, Tree, is_url
+from carlasc.storage.transport.remote_tree import RemoteTree, target_of
+from carlasc.storage.transport.trees import LocalTree, Target, Tree, is_url
 from carlasc.storage.transport.zipped import ZipTree
 
 PACKED = (".zarr", ".h5", ".hdf5", ".parquet")

@@ -140,8 +140,11 @@ class PublishedSequence(Sequence):
         paths = [self._prefix + entry.file(frame) for frame in frames]
         with_shape = entry.per in ("voxel", "vote", "moving voxel")
         shape = self.grids[entry.folder].size if with_shape else None
-        files = zip(paths, self.tree.read_many(paths, entry.size_of(shape)), strict=True)
-        return [entry.decode(data, self.tree.where(path), shape) for path, data in files]
+        arrays = []
+        for path, data in zip(paths, self.tree.read_many(paths, entry.size_of(shape)), strict=True):
+            # in Python 3.11, a comprehension is a level of calls
+            arrays.append(entry.decode(data, self.tree.where(path), shape))  # noqa: PERF401
+        return arrays
 
     def files_of(self, field: str, frames: Iterable[int]) -> list[str]:
         """Return the file of each frame."""

@@ -21,8 +21,7 @@ from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatErr
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.metadata import Metadata
-from carlasc.storage.protocol import Sequence
-from carlasc.storage.sinks import SequenceWriter
+from carlasc.storage.protocol import Sequence, SequenceWriter
 
 Kept = TypeVar("Kept")
 

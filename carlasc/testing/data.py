@@ -19,7 +19,7 @@ from carlasc.core.geometry import invert, multiply, rotations_of
 from carlasc.errors import ArgumentError
 from carlasc.storage import field_files, layout
 from carlasc.storage.folder import FolderSink
-from carlasc.storage.sinks import SequenceWriter
+from carlasc.storage.protocol import SequenceWriter
 
 FRAMES = (0, 1, 2, 5)
 """Frames of the sequence WHOLE."""

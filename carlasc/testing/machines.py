@@ -23,7 +23,7 @@ import numpy as np
 from carlasc.core.arrays import AnyArray
 from carlasc.errors import ConflictError, DependencyError
 from carlasc.storage import Sink, Source, layout
-from carlasc.storage.sinks import SequenceWriter
+from carlasc.storage.protocol import SequenceWriter
 from carlasc.testing.data import SCANS, SIZE, WHOLE, grid, lines, params, published_bytes, scan
 
 try:

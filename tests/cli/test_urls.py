@@ -29,7 +29,7 @@ from typer.testing import CliRunner
 
 from carlasc.captures import find_captures
 from carlasc.cli import app
-from carlasc.storage.transport.targets import RemoteTarget
+from carlasc.storage.transport.remote_tree import RemoteTarget
 
 pytest.importorskip("obstore")
 

@@ -27,7 +27,7 @@ from carlasc.errors import ArgumentError, DependencyError, MissingDataError
 from carlasc.motion import PoseOptions
 from carlasc.running import Run
 from carlasc.storage import Sink
-from carlasc.storage.sinks import SequenceWriter
+from carlasc.storage.protocol import SequenceWriter
 
 PLAIN = {"grids": None, "layout": LayoutOptions(flow="none"), "run": Run(workers=1)}
 

@@ -17,7 +17,7 @@ from carlasc.errors import ArgumentError, ConflictError, MissingDataError
 from carlasc.groundtruth import FromCapture, FromScans, Observation, Voting, count_votes, regrid
 from carlasc.groundtruth.inputs import choose_frames
 from carlasc.storage import FolderSource, Sink, layout
-from carlasc.storage.sinks import SequenceWriter
+from carlasc.storage.protocol import SequenceWriter
 
 SMALL = GridSpec.published().with_size((32, 32, 4))
 KEYS = ("grid_size", "min_bound", "max_bound", "num_channels", "coordinates")

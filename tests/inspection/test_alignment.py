@@ -9,8 +9,7 @@ import pytest
 
 from carlasc.core.geometry import invert
 from carlasc.core.tables import CARLA
-from carlasc.inspection.alignment import diagnose_poses, known_corrections
-from carlasc.inspection.structure import structure_of
+from carlasc.inspection.alignment import diagnose_poses, known_corrections, structure_of
 from carlasc.testing.drives import SimulatedDrive
 
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from carlasc.core.geometry import rotation_z, transform_points, translation
-from carlasc.inspection.alignment import choose_pairs, diagnose_poses
-from carlasc.inspection.structure import (
+from carlasc.inspection.alignment import (
     MAX_RANGE_M,
     MIN_RANGE_M,
+    choose_pairs,
+    diagnose_poses,
     occupancy,
     overlap,
     static_structure,

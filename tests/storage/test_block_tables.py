@@ -29,7 +29,7 @@ from carlasc import Run
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.storage import FolderSink, Sequence, pack, unpack
 from carlasc.storage.packed.stores import PackOptions
-from carlasc.storage.transport.targets import LocalTarget
+from carlasc.storage.transport.trees import LocalTarget
 from carlasc.storage.zarr.zarr_finish import finish
 from carlasc.storage.zarr.zarr_sink import ZarrSink, ZarrWriter
 
@@ -118,7 +118,7 @@ from pathlib import Path
 sys.path[:0] = sys.argv[2:]
 from storage.test_block_tables import start, write_block
 from carlasc.storage.zarr.zarr_finish import finish
-from carlasc.storage.transport.targets import LocalTarget
+from carlasc.storage.transport.trees import LocalTarget
 out = Path(sys.argv[1])
 writer = start(out)
 print("ready", flush=True)

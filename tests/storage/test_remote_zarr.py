@@ -26,7 +26,8 @@ from carlasc import Run
 from carlasc.errors import ConflictError
 from carlasc.storage.copying import unpack
 from carlasc.storage.packing import pack
-from carlasc.storage.transport.targets import LocalTarget, RemoteTarget, Target, target_of
+from carlasc.storage.transport.remote_tree import RemoteTarget, target_of
+from carlasc.storage.transport.trees import LocalTarget, Target
 from carlasc.storage.zarr.zarr_finish import finish
 from carlasc.storage.zarr.zarr_sink import ZarrSink
 

@@ -292,7 +292,7 @@ def test_a_run_that_ends_between_the_old_store_and_the_new_one_leaves_nothing_in
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr("carlasc.storage.transport.targets.LocalTarget.put", end)
+        patched.setattr("carlasc.storage.transport.trees.LocalTarget.put", end)
         with pytest.raises(KeyboardInterrupt):
             ZarrSink(store, overwrite=True)
     assert [entry.name for entry in tmp_path.iterdir()] == ["x.zarr.replaced"]

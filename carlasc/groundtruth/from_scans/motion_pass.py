@@ -44,8 +44,8 @@ from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence as StoredScans
+from carlasc.storage.protocol import SequenceWriter
 from carlasc.storage.resuming import derived_key, read_derived
-from carlasc.storage.sinks import SequenceWriter
 
 TRACKS, POSES = "tracks", "poses"
 """The names of the files with actors and with refined poses, in the folder of derived results."""

@@ -47,9 +47,8 @@ from carlasc.motion.tracks import FIRST_FOUND, MovingActors, is_doubtful
 from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath
-from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 from carlasc.storage.resuming import RECORD
-from carlasc.storage.sinks import SequenceWriter
 
 if TYPE_CHECKING:
     from carlasc.groundtruth.seen import Views
@@ -204,7 +203,8 @@ class ScanSequence(StoredSequence):
         """Refine the poses of the sequence, and find its actors, or read the results of an earlier
         run with `writer`.
         """
-        self.refine(writer, run, steps)
+        if self.refines:
+            self.use_refined(refine_sequence(self.feed, writer, run, steps))
         if self.feed.needs_actors:
             feed, speed = self.feed, self.options.motion.min_speed_m_s
             file = Kept.of(writer, TRACKS, feed, motion=feed.motion, min_speed_m_s=speed)
@@ -224,17 +224,12 @@ class ScanSequence(StoredSequence):
         """Whether poses may be refined."""
         return self.options.poses.refine != "never" and len(self.feed.frames) >= MIN_SCANS
 
-    def refine(self, writer: SequenceWriter | None, run: Run, steps: Callable[[int], None]) -> None:
-        """Refine the poses, or read the result of an earlier run with `writer`.
-
-        The feed then has the refined poses.
-        """
-        if not self.refines:
-            return
-        self.refined = refine_sequence(self.feed, writer, run, steps)
-        if self.refined.refined.any():
+    def use_refined(self, refined: RefinedPoses) -> None:
+        """Give the feed the refined poses, if any pose was refined."""
+        self.refined = refined
+        if refined.refined.any():
             self.feed = self.feed.with_poses_of(
-                with_refined_poses(self.posed, self.feed.frames, self.refined)
+                with_refined_poses(self.posed, self.feed.frames, refined)
             )
 
     def summaries(self) -> Series[Mapping[str, Any]] | None:

@@ -41,9 +41,8 @@ from carlasc.motion.tracks import MovingActors
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import FolderSink, layout
-from carlasc.storage.protocol import Source
+from carlasc.storage.protocol import SequenceWriter, Source
 from carlasc.storage.resuming import derived_key, read_derived, scans_digest
-from carlasc.storage.sinks import SequenceWriter
 
 _VERSION = 2  # version of the counts: it changes when the same input gives other sums
 _STRETCH, _STRETCHES = 8, 10  # frames of a stretch, and least number of stretches of a sequence

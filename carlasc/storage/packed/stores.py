@@ -20,8 +20,7 @@ from carlasc.storage import layout
 from carlasc.storage.files import AnyPath, damaged, leads_outside, unfinished
 from carlasc.storage.layout import identity_of
 from carlasc.storage.packed.output import refuse_existing, unfinished_error
-from carlasc.storage.protocol import Sequence, Source
-from carlasc.storage.sinks import SequenceWriter, Sink
+from carlasc.storage.protocol import Sequence, SequenceWriter, Sink, Source
 
 VERSION = 3  # of the format in docs/storage.md, the same for all packed stores
 STORE = "carlasc.store"

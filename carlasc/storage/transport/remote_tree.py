@@ -1,25 +1,37 @@
-"""Remote folders and files: a tree of files at a URL, and a remote file as a file object."""
+"""Remote folders and files: trees of files at a URL, remote files as file objects, and output
+folders at a URL.
+"""
 
 from __future__ import annotations
 
 import copy
 import io
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache, partial
 from typing import Any, TypeVar
 
-from carlasc.errors import MissingDataError, without_credentials
+from carlasc.errors import ArgumentError, MissingDataError, without_credentials
+from carlasc.running.spreading import Run
 from carlasc.storage.files import AnyPath
 from carlasc.storage.transport.clients import HUB, Client, FileSystemClient
 from carlasc.storage.transport.failures import WrongAnswerError, fail
 from carlasc.storage.transport.object_stores import SCHEMES, ObjectStoreClient
 from carlasc.storage.transport.requests import send
-from carlasc.storage.transport.trees import LocalTree, Tree, check_length, from_start, is_url
+from carlasc.storage.transport.trees import (
+    LocalTarget,
+    LocalTree,
+    Target,
+    Tree,
+    check_length,
+    from_start,
+    is_url,
+)
 from carlasc.storage.transport.web import HubClient, WebClient
 
 _BLOCK = 1 << 18  # bytes per block of a remote file
 _KEPT = 64  # blocks
+_MOST_REMOVED = 1000  # objects in one request: the limit of S3
 _CLIENTS: Mapping[str, type[Client]] = {
     **dict.fromkeys(SCHEMES, ObjectStoreClient),
     **dict.fromkeys(("http", "https"), WebClient),
@@ -255,3 +267,113 @@ class RemoteFile(io.RawIOBase):
         view[: end - start] = data
         self._place = end
         return end - start
+
+
+class RemoteTarget(Target):
+    """A folder in an object store: a prefix of the keys of a bucket.
+
+    An object exists only after all its bytes have arrived, so an upload is complete or absent.
+    Folders need not be created.
+
+    Attributes:
+        exclusive: whether the store has a create-only put, as S3 ("If-None-Match: *"), Google
+            Cloud Storage and Azure do. In others, `put` with `create` first checks whether the file
+            exists, so that two processes may both succeed.
+    """
+
+    tree: RemoteTree
+
+    def __init__(self, url: str, options: Mapping[str, Any] | None = None) -> None:
+        """Keep the URL of a folder and the fsspec storage options. No request is sent yet.
+
+        Raises:
+            ArgumentError: the URL cannot be written to, such as http and the Hugging Face Hub.
+            DependencyError: the URL needs a package that is not installed.
+        """
+        self.tree = RemoteTree(url, options)
+        self.location = self.tree.location
+        if found := self.tree.client.read_only:
+            raise ArgumentError(
+                self.location,
+                expected="a folder, or a URL of an object store",
+                found=found,
+                advice="write to a local folder, then upload it (Hub: `hf upload-large-folder`)",
+            )
+        self.exclusive = self.tree.client.exclusive
+
+    def below(self, folder: str) -> RemoteTarget:
+        """Return a folder in this one."""
+        target = copy.copy(self)
+        target.tree = self.tree.below(self._checked(folder))
+        target.location = target.tree.location
+        return target
+
+    def put(self, path: str, data: bytes | memoryview, *, create: bool = False) -> bool:
+        """Write an object with one request."""
+        return all(self._put({path: data}, os.urandom(16).hex() if create else None))
+
+    def put_many(self, *groups: Mapping[str, bytes | memoryview]) -> None:
+        """Write the objects of each group in parallel."""
+        for group in groups:
+            self._put(group)
+
+    def _put(self, files: Mapping[str, bytes | memoryview], mark: str | None = None) -> list[bool]:
+        puts = [(self._checked(path), bytes(data), mark) for path, data in files.items()]
+        written = self.tree.ask(self.tree.client.put, *puts, writing=True)
+        for path in files:
+            self.tree.note(path, True)
+        return written
+
+    def paths(self, folder: str = "") -> Iterator[str]:
+        """List all objects below the folder, 1000 per request."""
+        return self.tree.paths(self._checked(folder))
+
+    def remove(self, path: str) -> None:
+        """Remove the object of this name, and all objects below it."""
+        self.remove_many(self.paths(path))
+
+    def remove_many(self, paths: Iterable[str]) -> None:
+        """Remove objects, in S3 1000 per request. Missing objects are ignored."""
+        names = [self._checked(path) for path in paths]
+        urls = [self.tree.url(name) for name in names]
+        batches = [("", urls[i : i + _MOST_REMOVED]) for i in range(0, len(urls), _MOST_REMOVED)]
+        self.tree.ask(lambda _, batch: self.tree.client.remove(batch), *batches, writing=True)
+        for name in names:
+            self.tree.note(name, False)
+
+
+def target_of(out: AnyPath | Target, **storage_options: Any) -> Target:
+    """Return the Target for a path or a URL.
+
+    A Target is returned unchanged. Nothing is written yet.
+
+    Args:
+        out: a folder, or the URL of one in an object store.
+        **storage_options: options of fsspec for the URL.
+
+    Raises:
+        ArgumentError: nothing can be written to the URL.
+        DependencyError: the URL needs a package that is not installed.
+    """
+    if isinstance(out, Target):
+        return out
+    text = os.fspath(out)
+    return (
+        RemoteTarget(text, storage_options)
+        if is_url(text)
+        else LocalTarget(text.removeprefix("file://"))
+    )
+
+
+def check_shared(location: str, run: Run) -> None:
+    """Check that all processes of a run can access the output: `memory://` exists in one process
+    only.
+
+    Raises:
+        ArgumentError: the output is in memory, and the run has several processes.
+    """
+    if location.startswith("memory://") and not run.is_alone:
+        found = "an executor" if run.executor is not None else str(run.processes)
+        raise ArgumentError(
+            "workers", expected=f"1 with {location}, which exists in one process only", found=found
+        )

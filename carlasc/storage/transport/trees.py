@@ -1,4 +1,4 @@
-"""Trees of files, local or remote. They list folders and read ranges of bytes.
+"""Trees of files, which list folders and read ranges of bytes, and targets, which write files.
 
 Trees keep no handles open, so they can be pickled, and used on both sides of a fork.
 """
@@ -7,15 +7,16 @@ from __future__ import annotations
 
 import mmap
 import os
+import shutil
 import stat
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
 from carlasc.errors import CarlascError, FormatError, MissingDataError
-from carlasc.storage.files import AnyPath
+from carlasc.storage.files import AnyPath, leads_outside, write_atomic, write_many
 
 # Opening a pipe would hang without a writer; Windows would change the ends of lines.
 _READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
@@ -124,15 +125,19 @@ class LocalTree(Tree):
         """Whether the file exists, without listing its folder."""
         return (self.root / path).is_file()
 
-    def read(self, path: str, size: int | None = None) -> bytes | memoryview:
-        """Read the file, or map it into memory."""
-        with self._opened(path) as descriptor:
-            size = os.fstat(descriptor).st_size
-            if not self.mapped:
-                return os.read(descriptor, size)
-            if size == 0:
-                return b""  # an empty file, such as an empty scan, cannot be mapped
-            return memoryview(mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ))
+    def read_many(self, paths: Sequence[str], size: int | None = None) -> list[bytes | memoryview]:
+        """Read the files, or map them into memory."""
+        contents: list[bytes | memoryview] = []
+        for path in paths:
+            with self._opened(path) as descriptor:
+                length = os.fstat(descriptor).st_size
+                # an empty file, such as an empty scan, cannot be mapped
+                contents.append(
+                    memoryview(mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ))
+                    if self.mapped and length
+                    else os.read(descriptor, length)
+                )
+        return contents
 
     def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
         """Read the range."""
@@ -159,6 +164,123 @@ class LocalTree(Tree):
             raise MissingDataError(path, expected="a file", found="nothing") from error
         except OSError as error:
             raise FormatError(path, problem=f"cannot be read: {error.strerror or error}") from error
+
+
+class Target(ABC):
+    """A folder to write files to.
+
+    Paths in it are relative, with "/" between parts. It can be pickled.
+
+    Attributes:
+        location: its name in errors: a folder or a URL.
+        tree: reads the written files.
+    """
+
+    location: str
+    tree: Tree
+
+    @abstractmethod
+    def below(self, folder: str) -> Target:
+        """Return a folder in this one.
+
+        Raises:
+            FormatError: the path leads out of the folder.
+        """
+
+    def read(self, path: str) -> bytes | None:
+        """Return a file's bytes; None if it does not exist."""
+        try:
+            return bytes(self.tree.read(path))
+        except MissingDataError:
+            return None
+
+    @abstractmethod
+    def put(self, path: str, data: bytes | memoryview, *, create: bool = False) -> bool:
+        """Write a whole file, and create missing folders.
+
+        Args:
+            path: the file; an existing one is replaced unless `create` is given.
+            data: its bytes.
+            create: write only if the file does not exist. If several processes do this at once,
+                exactly one succeeds.
+
+        Returns:
+            False if `create` is given and the file exists; True otherwise.
+
+        Raises:
+            FormatError: the path leads out of the folder.
+            StorageError: the file cannot be written; no temporary file remains.
+        """
+
+    @abstractmethod
+    def put_many(self, *groups: Mapping[str, bytes | memoryview]) -> None:
+        """Write several groups of files, one group after the other.
+
+        Files of a group are written in parallel.
+        """
+
+    @abstractmethod
+    def paths(self, folder: str = "") -> Iterator[str]:
+        """Yield the paths of all files below a folder, in any order; nothing if the folder does not
+        exist.
+        """
+
+    @abstractmethod
+    def remove(self, path: str) -> None:
+        """Remove a file, or a folder with all files below it, if it exists."""
+
+    def remove_many(self, paths: Iterable[str]) -> None:
+        """Remove several files, if they exist. Object stores need few requests for this."""
+        for path in paths:
+            self.remove(path)
+
+    def _checked(self, path: str) -> str:
+        if leads_outside(path):
+            raise FormatError(
+                path, expected=f"a path inside {self.location}", found="a path that leads out of it"
+            )
+        return path
+
+
+class LocalTarget(Target):
+    """A folder on this machine."""
+
+    def __init__(self, folder: AnyPath) -> None:
+        self.folder = Path(folder)
+        self.location = str(self.folder)
+        self.tree = LocalTree(self.folder)
+
+    def below(self, folder: str) -> LocalTarget:
+        """Return a folder in this one."""
+        return LocalTarget(self._inside(folder))
+
+    def put(self, path: str, data: bytes | memoryview, *, create: bool = False) -> bool:
+        """Write a file under a temporary name, then rename it, or link it if `create` is given."""
+        return write_atomic(self._inside(path), data, create=create)
+
+    def put_many(self, *groups: Mapping[str, bytes | memoryview]) -> None:
+        """Write several files, which are synced together."""
+        write_many(
+            *({self._inside(path): data for path, data in group.items()} for group in groups)
+        )
+
+    def paths(self, folder: str = "") -> Iterator[str]:
+        """Yield the paths of all files, without temporary files of writers."""
+        for root, _, names in os.walk(self._inside(folder)):
+            for name in names:
+                if not name.startswith("."):
+                    yield (Path(root) / name).relative_to(self.folder).as_posix()
+
+    def remove(self, path: str) -> None:
+        """Remove a file or a folder."""
+        place = self._inside(path)
+        if place.is_dir() and not place.is_symlink():
+            shutil.rmtree(place)
+        else:
+            place.unlink(missing_ok=True)
+
+    def _inside(self, path: str) -> Path:
+        return self.folder / self._checked(path)
 
 
 def from_start(start: int, end: int, size: int) -> tuple[int, int]:

@@ -17,7 +17,7 @@ from carlasc.storage.files import damaged, parse_json, to_json
 from carlasc.storage.packed.array_fields import ArrayField
 from carlasc.storage.packed.array_layout import FieldLayout, FrameTable
 from carlasc.storage.packed.stores import PackOptions
-from carlasc.storage.transport.targets import LocalTarget, Target
+from carlasc.storage.transport.trees import LocalTarget, Target
 from carlasc.storage.zarr.shards import (
     METADATA,
     ZarrArray,

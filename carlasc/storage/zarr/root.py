@@ -11,7 +11,7 @@ from carlasc.errors import ArgumentError, ConflictError, StorageError
 from carlasc.storage.files import parse_json, rename, replaced, to_json
 from carlasc.storage.packed.output import remove
 from carlasc.storage.packed.stores import STORE, VERSION, PackOptions
-from carlasc.storage.transport.targets import LocalTarget, Target
+from carlasc.storage.transport.trees import LocalTarget, Target
 from carlasc.storage.zarr.shards import METADATA, group_metadata
 
 _TRIES = 5  # other processes may create, finish and replace the same store meanwhile

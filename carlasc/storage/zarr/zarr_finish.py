@@ -27,7 +27,8 @@ from carlasc.storage.packed.array_layout import (
 )
 from carlasc.storage.packed.chunks import SHUFFLE, Encoding, in_threads
 from carlasc.storage.packed.stores import STORE, VERSION, check_names
-from carlasc.storage.transport.targets import LocalTarget, Target, target_of
+from carlasc.storage.transport.remote_tree import target_of
+from carlasc.storage.transport.trees import LocalTarget, Target
 from carlasc.storage.zarr.block_tables import block_of, parse_table
 from carlasc.storage.zarr.root import read_root, remove_replaced
 from carlasc.storage.zarr.shards import (

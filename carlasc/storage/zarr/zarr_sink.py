@@ -18,8 +18,8 @@ from carlasc.storage.layout import identity_of
 from carlasc.storage.packed.array_layout import SEQUENCE, document_node, field_node, typical_size
 from carlasc.storage.packed.chunks import in_threads
 from carlasc.storage.packed.stores import VERSION, PackOptions, check_names, node_of
-from carlasc.storage.sinks import FrameArrays, SequenceWriter, Sink
-from carlasc.storage.transport.targets import LocalTarget, Target
+from carlasc.storage.protocol import FrameArrays, SequenceWriter, Sink
+from carlasc.storage.transport.trees import LocalTarget, Target
 from carlasc.storage.zarr.block_tables import EncodedFrame, StoredField, encode_frame
 from carlasc.storage.zarr.root import StoreRoot, existing_options
 from carlasc.storage.zarr.shards import METADATA, group_metadata

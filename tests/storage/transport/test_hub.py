@@ -20,7 +20,7 @@ import carlasc
 from carlasc.cli import app
 from carlasc.errors import ArgumentError, CarlascError, DependencyError, MissingDataError
 from carlasc.storage import FolderSource, Source
-from carlasc.storage.transport.targets import RemoteTarget
+from carlasc.storage.transport.remote_tree import RemoteTarget
 from carlasc.testing import SourceContract
 from carlasc.testing.data import WHOLE
 

@@ -22,7 +22,7 @@ import carlasc
 from carlasc.errors import CarlascError, DependencyError, FormatError, MissingDataError
 from carlasc.storage import Source, layout
 from carlasc.storage.packing import pack
-from carlasc.storage.transport.targets import RemoteTarget
+from carlasc.storage.transport.remote_tree import RemoteTarget
 from carlasc.storage.transport.web import WebClient
 from carlasc.testing import SourceContract
 from carlasc.testing.data import WHOLE

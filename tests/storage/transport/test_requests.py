@@ -40,9 +40,15 @@ from carlasc.errors import (
 from carlasc.storage import FolderSink
 from carlasc.storage.opening import as_sink
 from carlasc.storage.packing import pack
-from carlasc.storage.transport.remote_tree import RemoteFile, RemoteTree
+from carlasc.storage.transport.remote_tree import (
+    RemoteFile,
+    RemoteTarget,
+    RemoteTree,
+    check_shared,
+    target_of,
+)
 from carlasc.storage.transport.requests import RemoteSettings
-from carlasc.storage.transport.targets import RemoteTarget, Target, check_shared, target_of
+from carlasc.storage.transport.trees import Target
 from carlasc.testing import SinkContract
 
 pytest.importorskip("obstore")
