@@ -124,18 +124,13 @@ def convert(
     recordings = _deal(recordings, run.part)
     if isinstance(grids, GridOptions):
         _check_rays(recordings)
-    plans = [
-        plan_recording(
-            recording,
-            converter,
-            sink,
-            target,
-            poses,
-            flow=layout.flow == "auto",
-            voxels=isinstance(grids, str),
+    has_flow, has_voxels = layout.flow == "auto", isinstance(grids, str)
+    plans = []
+    for one in recordings:
+        planned = plan_recording(
+            one, converter, sink, target, poses, flow=has_flow, voxels=has_voxels
         )
-        for recording in recordings
-    ]
+        plans.append(planned)
     origin = f"{name if isinstance(name, str) else name.__name__} {root.name}"
     ranges = converter.min_range_m, converter.max_range_m
     said = {name: getattr(converter, name) for name in ("license", "citation", "simulated")}

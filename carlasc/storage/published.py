@@ -143,7 +143,7 @@ class PublishedSequence(Sequence):
         arrays = []
         for path, data in zip(paths, self.tree.read_many(paths, entry.size_of(shape)), strict=True):
             # in Python 3.11, a comprehension is a level of calls
-            arrays.append(entry.decode(data, self.tree.where(path), shape))  # noqa: PERF401
+            arrays.append(entry.decode(data, self.tree.where(path), shape))
         return arrays
 
     def files_of(self, field: str, frames: Iterable[int]) -> list[str]:
@@ -170,7 +170,7 @@ class PublishedSequence(Sequence):
 
     def read_document(self, name: str) -> bytes:
         """Return a text file's bytes."""
-        return bytes(self.tree.read(self._prefix + name))
+        return bytes(self.tree.read_many([self._prefix + name])[0])
 
     def unknown_files(self) -> tuple[str, ...]:
         """Return the files and folders of the sequence that are not part of the layout; names of
