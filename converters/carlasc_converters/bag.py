@@ -15,12 +15,12 @@ from carlasc.core import CameraModel
 from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, FormatError, MissingDataError
-from carlasc_converters.bag_messages import PATH, TRANSFORMS, read_placed
+from carlasc_converters.bag_messages import CAMERA_INFO, PATH, TRANSFORMS, read_placed
 from carlasc_converters.bag_sensors import BagCamera, BagFrame, CloudPlace, LidarTopic, find_cameras
 from carlasc_converters.bag_topics import BagFiles, Topic, find_bags
 from carlasc_converters.files import sequence_name
 from carlasc_converters.point_fields import TimeUnit
-from carlasc_converters.transforms import FrameTrack, FrameTree, PlacedFrame
+from carlasc_converters.transforms import BAD_SHARE, FrameTrack, FrameTree, PlacedFrame, are_poses
 
 _BASES = ("base_link", "base_footprint")  # names of the frame of a vehicle, by ROS' REP 105
 _WORLDS = ("odom", "map", "world")  # names of frames that do not move, the smoothest first
@@ -101,7 +101,8 @@ class BagRecording(Recording):
         self.name = sequence_name(files.paths[0].name.split(".")[0].removesuffix("_0"))
         self._pose_note, self._notes = "", list[str]()
         self._lidars = [
-            LidarTopic(topic, options.time_unit) for topic in files.clouds(options.topics)
+            LidarTopic(topic, options.time_unit, deskewed=options.deskewed)
+            for topic in files.clouds(options.topics)
         ]
 
     @cached_property
@@ -114,11 +115,11 @@ class BagRecording(Recording):
             zip(first.places, first.stamps.tolist(), strict=True)
         ):
             parts = [
-                (0, place, first.unit),
-                *((k, rows[number], others[k - 1].unit) for k, rows in enumerate(near, 1)),
+                (0, place, first.clock),
+                *((k, rows[number], others[k - 1].clock) for k, rows in enumerate(near, 1)),
             ]
             given = tuple(
-                CloudPlace(k, message, unit) for k, message, unit in parts if message is not None
+                CloudPlace(k, message, clock) for k, message, clock in parts if message is not None
             )
             frames.append(BagFrame(number, f"{place}: message {number}", stamp, given))
         return frames
@@ -224,7 +225,21 @@ class BagRecording(Recording):
         }
 
     def notes(self) -> list[str]:
-        """Return notes on incomplete files, and on what was assumed."""
+        """Return notes on incomplete files, on what was assumed, and on what is not read."""
+        read = {lidar.name for lidar in self._lidars} | {
+            camera.topic.channel.topic for camera in self._cameras.values() if camera.topic
+        }
+        if self._pose_note:
+            poses = self._files.poses(self._options.pose_topic)
+            read |= {poses.channel.topic} if poses else set()
+        left = [
+            *(name for lidar in self._lidars for name in lidar.unread),
+            *(
+                str(topic)
+                for name, topic in sorted(self._files.topics.items())
+                if name not in read and topic.channel.type not in (*TRANSFORMS, CAMERA_INFO)
+            ),
+        ]
         notes = [
             *self._files.notes(),
             *self._notes,
@@ -241,6 +256,8 @@ class BagRecording(Recording):
                 f"{self.location}: no transforms lead from {self._lidars[0].frame} to "
                 f"{self._unplaced}: both are taken as the same frame"
             )
+        if left:
+            notes.append(f"{self.location}: not read: {', '.join(left)}")
         return list(dict.fromkeys(notes))
 
     @cached_property
@@ -285,16 +302,28 @@ class BagRecording(Recording):
 
         Of a topic of paths, the last message is read, which holds the whole path.
         """
-        places, errors = list(topic.places()), list[FormatError]()
+        places, errors, bad, good = list(topic.places()), list[FormatError](), list[str](), 0
         for place in places[-1:] if topic.channel.type == PATH else places:
             try:
-                yield from read_placed(place.read(), place.channel, str(place))
+                placed = read_placed(place.read(), place.channel, str(place))
             except FormatError as error:
                 errors.append(error)
+                continue
+            bad += (f"{place}: {one.pose}" for one in placed if not are_poses(one.pose))
+            good += len(placed)
+            yield from (one for one in placed if are_poses(one.pose))
         if errors:
             self._notes.append(
                 f"{errors[0]}: so {len(errors)} of {len(places)} messages are left out"
             )
+        if len(bad) > BAD_SHARE * good:
+            raise FormatError(
+                f"{self.location}: {topic.channel.topic}",
+                expected="a position, and a rotation: a quaternion w, x, y, z of length 1",
+                found=f"{len(bad)} of {good} others, such as {bad[0]}",
+            )
+        if bad:
+            self._notes.append(f"{bad[0]} is no pose: {len(bad)} of {good} are left out")
 
     def _poses_of_tree(self, *, required: bool) -> tuple[IntArray, FloatArray] | None:
         """Return times and poses of the vehicle in the world; None if the vehicle does not move in
