@@ -91,17 +91,17 @@ def ros_type(name: str) -> str:
     return name if "/" in kind or not slash else f"{package}/msg/{kind}"
 
 
-def decompressed(data: bytes, codec: str, where: str, size: int | None = None) -> bytes:
+def decompressed(data: bytes, codec: str, where: str, size: int = MAX_UNPACKED) -> bytes:
     """Return the content of a chunk.
 
     Args:
         data: the chunk.
         codec: its compression; empty or "none" without one.
         where: the file, for errors.
-        size: bytes of the content; None if they are not known.
+        size: the greatest number of bytes of the content.
 
     Raises:
-        FormatError: the codec is not known, the chunk is damaged, or has another size.
+        FormatError: the codec is not known, the chunk is damaged, or has more bytes.
         DependencyError: the codec is not installed.
     """
     if codec in ("", "none"):
@@ -115,8 +115,8 @@ def decompressed(data: bytes, codec: str, where: str, size: int | None = None) -
         )
     module, name = _CODECS[codec]
     decoder = getattr(import_extra(module, EXTRA), name)
-    check_size(size or 0, where)
-    parts, left = list[bytes](), MAX_UNPACKED if size is None else size
+    check_size(size, where)
+    parts, left = list[bytes](), size
     try:
         while data and left >= 0:  # a chunk may be several streams
             stream = decoder()
@@ -129,12 +129,9 @@ def decompressed(data: bytes, codec: str, where: str, size: int | None = None) -
         raise FormatError(
             where, expected=f"a chunk compressed with {codec}", found=f"damage ({error})"
         ) from error
-    if left < 0 or (size is not None and left):
+    if left < 0:
         raise FormatError(
-            where,
-            expected=f"a chunk of {MAX_UNPACKED if size is None else size} bytes, compressed with "
-            f"{codec}",
-            found="more" if left < 0 else f"{size - left}",  # type: ignore[operator]
+            where, expected=f"a chunk of {size} bytes, compressed with {codec}", found="more"
         )
     return b"".join(parts)
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from numpy.lib.recfunctions import structured_to_unstructured, unstructured_to_structured
 
 from carlasc.core.arrays import AnyArray, RecordArray, Uint8Array
 from carlasc.core.compiling import cached
@@ -130,18 +129,11 @@ def _read_header(file: BinaryIO, where: str) -> PcdHeader:
 
 
 def _rows_of_text(body: bytes, row: np.dtype[np.void]) -> RecordArray:
-    """Return the rows of a text body. Whole numbers may be written as in 1.5e+03."""
+    """Return the rows of a text body."""
     try:
         return np.loadtxt(io.BytesIO(body), row, comments=None, ndmin=1)
-    except ValueError:
-        table = np.loadtxt(io.BytesIO(body), np.float64, comments=None, ndmin=2)
-        rows = np.empty(len(table), row)
-        with np.errstate(invalid="ignore"):
-            rows[:] = unstructured_to_structured(table, row, casting="unsafe")
-        back = structured_to_unstructured(rows, np.float64)
-        if not np.allclose(back, table, rtol=1e-6, equal_nan=True):
-            raise
-        return rows
+    except ValueError:  # whole numbers may be written as in 1.5e+03
+        return np.loadtxt(io.BytesIO(body), row, comments=None, ndmin=1, converters=float)
 
 
 def _unpacked(body: bytes, row: np.dtype[np.void], count: int, where: str) -> bytes:

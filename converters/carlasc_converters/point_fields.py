@@ -11,7 +11,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from carlasc.core.arrays import AnyArray, BoolArray, FloatArray, Uint8Array, Uint32Array
+from carlasc.core.arrays import (
+    AnyArray,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    Uint8Array,
+    Uint32Array,
+)
 from carlasc.errors import FormatError
 
 # Types of sensor_msgs/PointField:
@@ -92,33 +99,18 @@ Columns = Mapping[str, AnyArray]
 """(N,) values of points by the names of a file or a message, in any case."""
 
 # The usual names, in lower case, of each field; the first that exists is taken.
-_NAMES: dict[str, tuple[str, ...]] = {
-    "x": ("x", "x_m"),
-    "y": ("y", "y_m"),
-    "z": ("z", "z_m"),
+_NAMES = {
+    "x": ["x", "x_m"],
+    "y": ["y", "y_m"],
+    "z": ["z", "z_m"],
     "intensity": (
-        "intensity",
-        "intensities",
-        "i",
-        "reflectivity",
-        "reflectance",
-        "remission",
-        "scalar_intensity",
-    ),
-    "ring": ("ring", "channel", "line", "laser_id", "row"),
-    "label": ("label", "labels", "class", "semantic", "classification", "scalar_label"),
-    "instance": ("instance", "instances", "instance_id", "object_id", "track_id"),
+        "intensity intensities i reflectivity reflectance remission scalar_intensity"
+    ).split(),
+    "ring": "ring channel line laser_id row".split(),
+    "label": "label labels class semantic classification scalar_label".split(),
+    "instance": "instance instances instance_id object_id track_id".split(),
 }
-TIMES = (
-    "t",
-    "time",
-    "timestamp",
-    "time_stamp",
-    "times",
-    "offset_time",
-    "gps_time",
-    "scalar_time",
-)
+TIMES = "t time timestamp time_stamp times offset_time gps_time scalar_time".split()
 # Other names of times, and their unit; FAST-LIO puts milliseconds into `curvature`.
 _TIME = re.compile(
     r"(?:scalar_)?(?P<base>curvature|\w*(?:time|stamp)\w*?|ts?|dt)?"
@@ -211,7 +203,7 @@ def find_clock(
     problem: FormatError | None = None
     for choice in _time_columns(scans[0][0]):
         clock = replace(choice, needed=needed, unit=choice.unit if unit == "auto" else unit)
-        found = False
+        usual, found = choice.names[0] in TIMES, False
         for columns, stamp_ns in scans:
             times, returned = clock.of(columns), returns(columns)
             if times is None:
@@ -219,22 +211,15 @@ def find_clock(
             try:
                 seconds, start, name = point_seconds(times, clock.unit, where, returned)
             except FormatError as error:
-                problem = problem or (error if choice.names[0] in TIMES else None)
+                problem = problem or (error if usual else None)
                 continue
             duration = float(np.ptp(seconds)) if len(seconds) else 0.0
-            if not duration or (choice.names[0] not in TIMES and duration < _SCAN_S[0]):
+            if duration <= (0 if usual else _SCAN_S[0]):
                 continue  # such as the curvature of a surface
-            own = start is not None and stamp_ns is not None
-            own = own and abs(start - stamp_ns) > _CLOCK_S * 1e9  # type: ignore[operator]
-            clock, found = (
-                replace(
-                    clock,
-                    unit=name,
-                    absolute=clock.absolute or start is not None,
-                    own=clock.own or own,
-                ),
-                True,
-            )
+            clock, found = replace(clock, unit=name), True
+            if start is not None:
+                own = stamp_ns is not None and abs(start - stamp_ns) > _CLOCK_S * 1e9
+                clock = replace(clock, absolute=True, own=clock.own or own)
         if found:
             return clock
     if problem is not None and needed:
@@ -279,8 +264,8 @@ def named_fields(
         and `ring` (N,), unchanged, and `label` and `instance` (N,) uint32.
 
     Raises:
-        FormatError: x, y or z does not exist, points are farther away than a sensor can see, or a
-            class or an instance is not a whole number from 0 to 2^32 - 1.
+        FormatError: x, y or z does not exist, or a class or an instance is not a whole number from
+            0 to 2^32 - 1.
     """
     given = {field: _column(columns, field) for field in _NAMES}
     if missing := [field for field in ("x", "y", "z") if given[field] is None]:
@@ -294,18 +279,6 @@ def named_fields(
     for axis, field in enumerate(("x", "y", "z", "intensity")):
         if given[field] is not None:
             points[:, axis] = given[field]
-    sample = slice(None, None, max(1, count // _SAMPLE))
-    seen = returns({name: values[sample] for name, values in columns.items()})
-    if seen.any():
-        far_m = float(np.median(np.abs(points[sample][seen, :3]).max(axis=1)))
-        if far_m > _FARTHEST_M:
-            raise FormatError(
-                where,
-                expected="points in the frame of the sensor, in metres",
-                found=f"half of them more than {far_m / 1000:,.0f} km away",
-                advice="they are in the world frame (such as UTM), or in millimetres: transform "
-                "them by the inverse of the pose of each scan",
-            )
     fields: dict[str, AnyArray] = {"points": points}
     if clock is not None and (times := clock.of(columns)) is not None:
         fields["time"] = times
@@ -315,6 +288,24 @@ def named_fields(
         if (values := given[field]) is not None:
             fields[field] = whole_numbers(values, f"{where}: {field}")
     return fields
+
+
+def check_near(points: Float32Array, where: str) -> None:
+    """Check that (N, 4) points are so near that a sensor at the origin can see them.
+
+    Raises:
+        FormatError: half of them are farther away.
+    """
+    sample = np.abs(points[:: max(1, len(points) // _SAMPLE), :3]).max(axis=1)
+    far_m = float(np.nanmedian(sample)) if np.isfinite(sample).any() else 0.0
+    if far_m > _FARTHEST_M:
+        raise FormatError(
+            where,
+            expected="points in the frame of the sensor, in metres",
+            found=f"half of them more than {far_m / 1000:,.0f} km away",
+            advice="they are in the world frame (such as UTM), or in millimetres: transform them "
+            "by the inverse of the pose of each scan",
+        )
 
 
 def _column(columns: Columns, field: str) -> AnyArray | None:
@@ -334,11 +325,10 @@ def returns(columns: Columns) -> BoolArray:
 
 def unread(columns: Columns, clock: PointClock | None, *, classes: bool = False) -> list[str]:
     """Return the names of the columns that are not read."""
-    fields = ["x", "y", "z", "intensity", *(("label", "instance") if classes else ())]
-    taken = [
-        next((n for n in _NAMES[f] if n in {name.lower() for name in columns}), "") for f in fields
-    ]
-    taken += () if clock is None else clock.names
+    lower = [name.lower() for name in columns]
+    fields = _NAMES.keys() - {"ring"} - (set() if classes else {"label", "instance"})
+    taken = {next((name for name in _NAMES[field] if name in lower), "") for field in fields}
+    taken |= set() if clock is None else {*clock.names}
     return [name for name in columns if name.lower() not in taken]
 
 
@@ -393,10 +383,10 @@ def point_seconds(
         raise FormatError(
             f"{where}: times of points", expected="finite numbers", found="NaN or infinity"
         )
-    values = times[known]
-    first, last = (values.min(), values.max()) if len(values) else (0, 0)
-    whole = times.dtype.kind in "iu"
-    span = int(last) - int(first) if whole else float(last) - float(first)
+    first = times[known].min() if known.any() else 0
+    with np.errstate(invalid="ignore", over="ignore"):
+        after = (times - first).astype(np.float64)
+    span = after[known].max() if known.any() else 0.0
     if span == 0:
         # a column that was not filled in, or with the time of the scan
         return np.zeros(len(times)), None, "s" if unit == "auto" else unit
@@ -411,7 +401,7 @@ def point_seconds(
                 f"{where}: times of points",
                 expected="a scan of 4 ms to 0.6 s in seconds, milliseconds, microseconds or "
                 "nanoseconds",
-                found=f"times from {first} to {last}",
+                found=f"times from {first} to {times[known].max()}",
                 advice="give their unit with `time_unit`",
             )
         unit = usual
@@ -420,20 +410,16 @@ def point_seconds(
         raise FormatError(
             f"{where}: times of points",
             expected=f"a scan of at most {_LONGEST_S:.0f} s",
-            found=f"{span * scale / 1e9:.6g} s, from {first} to {last} {unit}",
+            found=f"{span * scale / 1e9:.6g} s, from {first} to {times[known].max()} {unit}",
             advice="check `time_unit`, or leave them out with `deskewed`",
         )
-    start = None
-    if not absolute and abs(float(first)) * scale / 1e9 <= _CLOCK_S:
-        seconds = np.asarray(times, np.float64) * (scale / 1e9)
-        middle = float(first) * (scale / 1e9)
-    else:
+    usable = known | (np.abs(after) * (scale / 1e9) <= _LONGEST_S)
+    if absolute or abs(float(first)) * scale / 1e9 > _CLOCK_S:
         # A clock's float64 seconds keep 0.2 microseconds; whole numbers keep all.
-        with np.errstate(invalid="ignore", over="ignore"):
-            seconds, middle = (times - first).astype(np.float64) * (scale / 1e9), 0.0
+        seconds, whole = after * (scale / 1e9), times.dtype.kind in "iu"
         start = int(first) * scale if whole else round(float(first) * scale)
-    with np.errstate(invalid="ignore"):
-        usable = known | (np.abs(seconds - middle) <= _LONGEST_S)
+    else:
+        seconds, start = np.asarray(times, np.float64) * (scale / 1e9), None
     if not usable.all():
         places = np.flatnonzero(usable)
         seconds = np.interp(np.arange(len(times)), places, seconds[places])

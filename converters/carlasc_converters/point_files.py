@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from carlasc.core.arrays import AnyArray, FloatArray
+from carlasc.core.arrays import AnyArray
 from carlasc.errors import ArgumentError, FormatError, import_extra
 from carlasc.storage.arrays import NUMBERS, ArrayFormat, open_npz, read_npy
 from carlasc_converters.files import COPY, opening, read_bytes
@@ -20,6 +20,8 @@ from carlasc_converters.ply import PlyVertices
 _FIRST = ("x", "y", "z", "intensity")  # the columns of an array without names
 _MOST_COLUMNS = 12
 _FLOAT = 4
+_FEW = 2000  # values, from which the number of columns is not found
+_ALIKE = 0.5  # rows of the right width are more alike than others by this
 _VALUES = 27720  # of a file are compared; each number of columns up to 12 divides it
 _ARRAY = ArrayFormat(NUMBERS, None, records=True)
 
@@ -70,33 +72,21 @@ def _read_bin(path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray
             found=str(len(data)),
             advice=f"check `columns` ({','.join(columns)})",
         )
-    rows = values.reshape(-1, len(columns))
-    _check_width(rows, path)
-    return dict(zip(columns, rows.T, strict=True))
-
-
-def _check_width(rows: FloatArray, path: Path) -> None:
-    """Check that neighbouring rows are alike, more than if the values had other columns.
-
-    Raises:
-        FormatError: rows of another width fit much better.
-    """
-    width = rows.shape[1]
+    width, sample = len(columns), values[:_VALUES]
     unlike = {
-        number: _unlikeness(rows.reshape(-1)[: _VALUES // number * number].reshape(-1, number))
-        for number in range(3, _MOST_COLUMNS + 1)
-        if rows.size % number == 0 and number % width
+        number: _unlikeness(sample.reshape(-1, number))
+        for number in {width, *range(3, _MOST_COLUMNS + 1)}
+        if count % number == 0 and len(sample) % number == 0
     }
-    if not unlike or len(rows) < _VALUES // 60:
-        return
-    best = min(unlike, key=unlike.__getitem__)
-    if unlike[best] < 0.5 * _unlikeness(rows[: _VALUES // width]):
+    best = min(unlike, key=unlike.__getitem__, default=width)
+    if best % width and count > _FEW and unlike[best] < _ALIKE * unlike[width]:
         raise FormatError(
             path,
             expected=f"points of {width} columns",
             found=f"values that fit points of {best}",
             advice=f"name all {best} columns with `columns`",
         )
+    return dict(zip(columns, values.reshape(-1, width).T, strict=True))
 
 
 def _unlikeness(rows: AnyArray) -> float:

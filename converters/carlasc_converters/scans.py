@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -25,6 +26,7 @@ from carlasc_converters.pcd import PcdHeader, read_header
 from carlasc_converters.point_fields import (
     PointClock,
     TimeUnit,
+    check_near,
     find_clock,
     named_fields,
     point_seconds,
@@ -247,7 +249,10 @@ class ScanFolder(Recording):
     def _first(self) -> dict[str, AnyArray]:
         """The fields of the first scan."""
         path, columns = self._samples[0]
-        return named_fields(columns, str(path), self._clock)
+        fields = named_fields(columns, str(path), self._clock)
+        if not self._in_world:
+            check_near(fields["points"], str(path))
+        return fields
 
     @cached_property
     def _clock(self) -> PointClock | None:
@@ -261,9 +266,15 @@ class ScanFolder(Recording):
         """(F, 4, 4) poses of the scans in the headers of PCD files; None if they have none, or all
         the same.
         """
-        if self._paths[0].suffix.lower() != ".pcd":
+        if self._paths[0].suffix.lower() != ".pcd" or len(self._files) > 1:
             return None
-        rows = np.array(_viewpoints(self._paths), np.float64)
+        found = [PcdHeader.viewpoint]
+        for path in self._paths:
+            try:
+                found.append(read_header(path).viewpoint)
+            except FormatError:
+                found.append(found[-1])  # reading its scan reports the error
+        rows = np.array(found[1:], np.float64)
         if np.ptp(rows, axis=0).max() == 0 or not are_poses(rows).all():
             return None
         return poses_of(rows[:, 3:], rows[:, :3], self.location)
@@ -273,7 +284,7 @@ class ScanFolder(Recording):
         """Whether the points of scans are in the frame of the viewpoints: nearer to these than to
         the origin.
         """
-        if self._viewpoints is None or len(self._files) > 1:
+        if self._viewpoints is None:
             return False
         row = int(np.argmax(np.abs(self._viewpoints[:, :3, 3]).max(axis=1)))
         columns = read_columns(self._paths[row], None)
@@ -344,24 +355,18 @@ class ScanFolder(Recording):
         """Return the (F,) nanoseconds of the first point of each scan; between those of the others
         where a scan cannot be read.
         """
-        starts = list[int | None]()
-        for path in self._paths:
-            try:
+        found = dict[int, int]()
+        for row, path in enumerate(self._paths):
+            with suppress(FormatError):
                 columns = read_columns(path, self._options.columns)
-                times = clock.of(columns)
-                starts.append(
-                    None
-                    if times is None
-                    else point_seconds(times, clock.unit, str(path), returns(columns), True)[1]
-                )
-            except FormatError:
-                starts.append(None)
-        known = [row for row, start in enumerate(starts) if start is not None]
-        first = starts[known[0]] or 0
-        rows = np.arange(len(starts))
-        after = np.interp(rows, known, [(starts[row] or 0) - first for row in known])
+                if (times := clock.of(columns)) is not None:
+                    seen = returns(columns)
+                    start = point_seconds(times, clock.unit, str(path), seen, absolute=True)[1]
+                    found |= {} if start is None else {row: start}
+        first, rows, known = next(iter(found.values())), np.arange(len(self._paths)), list(found)
+        after = np.interp(rows, known, [start - first for start in found.values()])
         period = after[known[-1]] / max(1, known[-1] - known[0])
-        after += period * (rows - np.clip(rows, known[0], known[-1]))
+        after += period * (rows - rows.clip(known[0], known[-1]))
         return first + np.round(after).astype(np.int64)
 
     @cached_property
@@ -551,17 +556,6 @@ def _path(name: str | None) -> Path | None:
 def _natural(path: Path) -> list[Any]:
     """Return a key for natural sorting: scan2 before scan10."""
     return [int(part) if part.isdigit() else part.lower() for part in re.split(r"(\d+)", path.name)]
-
-
-def _viewpoints(paths: Sequence[Path]) -> list[tuple[float, ...]]:
-    """Return the viewpoints of PCD files; that of the file before for one that cannot be read."""
-    rows = [PcdHeader.viewpoint]
-    for path in paths:
-        try:
-            rows.append(read_header(path).viewpoint)
-        except FormatError:
-            rows.append(rows[-1])  # reading its scan reports the error
-    return rows[1:]
 
 
 def _span(stamps: IntArray) -> str:
