@@ -13,7 +13,7 @@ import numpy as np
 
 from carlasc.converting.protocol import Cloud, FrameHandle
 from carlasc.core import CameraModel
-from carlasc.core.arrays import BoolArray, FloatArray, IntArray
+from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.cameras import Lens
 from carlasc.core.geometry import Transform, transform_points
 from carlasc.errors import FormatError, reading
@@ -36,6 +36,7 @@ from carlasc_converters.point_fields import (
     check_near,
     find_clock,
     named_fields,
+    returns,
     unread,
 )
 
@@ -215,7 +216,7 @@ class BagFrame(FrameHandle):
         where = str(cloud.place)
         message = read_cloud(cloud.place.read(), cloud.place.channel, where)
         points = named_fields(message.columns, where)["points"]
-        seen: BoolArray = np.isfinite(points[:, :3]).all(axis=1) & points[:, :3].any(axis=1)
+        seen = returns(message.columns)
         if not seen.any():
             raise FormatError(self.location, expected="points", found="none")
         points, seconds = points[seen], None
