@@ -232,11 +232,9 @@ def _time_columns(columns: Columns) -> list[PointClock]:
     lower = [name.lower() for name in columns]
     usual = [PointClock((name,), "auto") for name in TIMES if name in lower]
     parts = {name: match for name in lower if (match := _TIME.fullmatch(name))}
+    units: dict[str | None, Any] = {"curvature": "ms"}
     others = [
-        PointClock(
-            (name,),
-            "ms" if match["base"] == "curvature" else match["unit"] or "auto",  # type: ignore[arg-type]
-        )
+        PointClock((name,), units.get(match["base"], match["unit"] or "auto"))
         for name, match in parts.items()
         if match["base"] and name not in TIMES
     ]
