@@ -23,6 +23,7 @@ from carlasc_converters.point_fields import TimeUnit
 from carlasc_converters.transforms import BAD_SHARE, FrameTrack, FrameTree, PlacedFrame, are_poses
 
 _BASES = ("base_link", "base_footprint")  # names of the frame of a vehicle, by ROS' REP 105
+_MOVED = 0.2  # metres, or sine of an angle, by which a LiDAR may move on the vehicle
 _WORLDS = ("odom", "map", "world")  # names of frames that do not move, the smoothest first
 
 
@@ -130,12 +131,15 @@ class BagRecording(Recording):
 
         Raises:
             MissingDataError: there are several, and no transforms between them.
+            FormatError: one moves on the vehicle, or its points are in the frame of the world.
         """
-        tree, at, sensors = self._tree, self._lidars[0].stamps[:1], list[Sensor]()
+        tree, sensors = self._tree, list[Sensor]()
         for lidar in self._lidars:
             if not tree.connected(lidar.frame, self._vehicle):
                 raise self._no_path(lidar.frame, self._vehicle, "convert one LiDAR with `topics`")
-            place = tree.lookup(self._vehicle, lidar.frame, at)[0]
+            place, last = tree.lookup(self._vehicle, lidar.frame, lidar.stamps[[0, -1]])
+            if np.abs(last - place).max() > _MOVED:
+                raise self._in_world(lidar.frame)
             sensors.append(Sensor(lidar.name, place, deskewed=self._options.deskewed))
         return sensors
 
@@ -164,6 +168,8 @@ class BagRecording(Recording):
             where = f"{self.location}: {topic.channel.topic}"
             track = FrameTrack(where)
             for placed in self._placed(topic):
+                if placed.parent == self._lidars[0].frame and not force:
+                    raise self._in_world(placed.parent)
                 track.add(placed)
             if not len(track):
                 raise FormatError(where, expected="poses", found="none that can be read")
@@ -355,6 +361,14 @@ class BagRecording(Recording):
         expected = f"transforms from {frame} to {target}"
         return MissingDataError(
             self.location, expected=expected, found=f"only {self._tree}", advice=advice
+        )
+
+    def _in_world(self, frame: str) -> FormatError:
+        return FormatError(
+            self.location,
+            expected="points in a frame that does not move on the vehicle",
+            found=f"the frame {frame}, which does: such as that of the world",
+            advice="convert the topic of points in the frame of the sensor",
         )
 
     def _seconds(self, stamps: IntArray) -> FloatArray:

@@ -173,8 +173,8 @@ _TEXTS = dict.fromkeys(TRANSFORMS[:2], _TRANSFORM_TEXT) | {
 }
 _POINT = np.dtype(
     {
-        "names": ["offset_time", "x", "y", "z", "reflectivity", "tag", "line"],
-        "formats": ["u4", "f4", "f4", "f4", "u1", "u1", "u1"],
+        "names": "offset_time x y z reflectivity tag line".split(),
+        "formats": "u4 f4 f4 f4 u1 u1 u1".split(),
     }
 )
 _ENCODINGS = {"ros1": "ros", "cdr": "ros", "protobuf": "foxglove", "json": "foxglove"}

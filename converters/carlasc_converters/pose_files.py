@@ -17,6 +17,7 @@ import numpy as np
 
 from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.geometry import check_rigid
+from carlasc.core.tables import lines_of
 from carlasc.errors import FormatError
 from carlasc.storage.arrays import NUMBERS, ArrayFormat, read_npy
 from carlasc_converters.files import opening, read_text
@@ -32,14 +33,17 @@ _NAME = re.compile(
     r"|(?P<seconds>[1-9]\d{8,9})(?=[-_]))(?:(?:(?P<point>\.)|[-_])(?P<rest>\d{1,9}))?"
     r"|(?P<number>[1-9]\d{9,}(?:\.\d+)?|\d+\.\d{6,}))\D*"
 )
-_PLACES = (
-    ("x", "y", "z"),
-    ("tx", "ty", "tz"),
-    ("px", "py", "pz"),
-    ("p_rs_r_x", "p_rs_r_y", "p_rs_r_z"),
-)
-_TURNS = (("qw", "qx", "qy", "qz"), ("q_rs_w", "q_rs_x", "q_rs_y", "q_rs_z"))
-_TIMES = ("timestamp", "time", "t", "stamp", "seconds", "sec", "nsec", "timestamp_ns", "time_ns")
+_PLACES = lines_of("""
+    x y z
+    tx ty tz
+    px py pz
+    p_rs_r_x p_rs_r_y p_rs_r_z
+""")
+_TURNS = lines_of("""
+    qw qx qy qz
+    q_rs_w q_rs_x q_rs_y q_rs_z
+""")
+_TIMES = "timestamp time t stamp seconds sec nsec timestamp_ns time_ns".split()
 # A number above one of these is in milliseconds, microseconds or nanoseconds; in seconds, it would
 # be a recording of years.
 _UNITS = ((Decimal(10) ** 17, 1), (Decimal(10) ** 14, 10**3), (Decimal(10) ** 11, 10**6))
@@ -147,7 +151,7 @@ def nanoseconds(word: str) -> int:
 def _read_named(
     header: Sequence[str], rows: Sequence[list[str]], path: Path, of: PoseOf = "sensor"
 ) -> PoseRows:
-    def columns(choices: Sequence[tuple[str, ...]], what: str) -> list[int]:
+    def columns(choices: Sequence[list[str]], what: str) -> list[int]:
         for names in choices:
             if all(name in header for name in names):
                 return [header.index(name) for name in names]

@@ -422,6 +422,23 @@ def test_a_pose_that_is_none_is_left_out_and_the_bag_may_be_zipped(tmp_path):
         assert "no pose: 1 of" in said and "/chatter (String" in said
 
 
+@pytest.mark.parametrize("poses", ["odometry", "tf"])
+def test_points_of_a_bag_in_the_frame_of_the_world_are_refused(tmp_path, poses):
+    def messages(store):
+        found = bags.drive_messages(store, DRIVE, poses)
+        for message in found:
+            if message[0].endswith("/points"):
+                message[3].header.frame_id = bags.WORLD
+        return found
+
+    store = bags.Messages("mcap")
+    bag = bags.write_bag(tmp_path, "mcap", messages(store), store=store)
+    (recording,) = Bag(bag).sequences()
+    with raises(FormatError, expected="does not move", found=bags.WORLD, advice="sensor"):
+        recording.poses()
+        recording.sensors  # noqa: B018
+
+
 def test_whole_data_with_a_wrong_size_of_rows_are_read():
     store = bags.Messages("db3")
     points = bags.velodyne(DRIVE.scan(0).points, DRIVE.scan(0).seconds)
