@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from carlasc.converting.assembling import Rig, read_scan
+from carlasc.converting.assembling import Assembled, Rig, read_scan
 from carlasc.converting.plans import (
     FILE,
     KISS_ICP,
@@ -21,6 +21,7 @@ from carlasc.converting.plans import (
 from carlasc.converting.protocol import Converter, Recording
 from carlasc.converting.registry import find_recordings, open_converter
 from carlasc.core.arrays import Float32Array
+from carlasc.errors import CarlascError
 from carlasc.motion.ground import find_ground
 from carlasc.motion.options import PoseOptions
 from carlasc.storage.files import AnyPath
@@ -106,9 +107,7 @@ def preview(
 def _preview(recording: Recording, poses: PoseOptions) -> RecordingPreview:
     times = recording.times()
     trajectory = read_trajectory(recording, frame_times(recording, times), poses)
-    scan = read_scan(
-        recording.frames[0], Rig(tuple(recording.sensors), recording.vehicle_T_scan), None
-    )
+    scan = _first_scan(recording)
     steps = (
         np.zeros(0)
         if times is None
@@ -136,6 +135,18 @@ def _preview(recording: Recording, poses: PoseOptions) -> RecordingPreview:
         KISS_ICP if trajectory is None else FILE,
         tuple(recording.notes()),
     )
+
+
+def _first_scan(recording: Recording) -> Assembled:
+    """Return the first scan that can be read; the error of the first one if there is none."""
+    rig, problem = Rig(tuple(recording.sensors), recording.vehicle_T_scan), None
+    for handle in recording.frames:
+        try:
+            return read_scan(handle, rig, None)
+        except CarlascError as error:
+            problem = problem or error
+    assert problem is not None
+    raise problem
 
 
 def _ground(points: Float32Array) -> tuple[str | None, float | None]:

@@ -15,14 +15,15 @@ from carlasc.core import CameraModel
 from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, FormatError, MissingDataError
-from carlasc_converters.bag_messages import PATH, TRANSFORMS, read_placed
+from carlasc_converters.bag_messages import CAMERA_INFO, PATH, TRANSFORMS, read_placed
 from carlasc_converters.bag_sensors import BagCamera, BagFrame, CloudPlace, LidarTopic, find_cameras
 from carlasc_converters.bag_topics import BagFiles, Topic, find_bags
 from carlasc_converters.files import sequence_name
 from carlasc_converters.point_fields import TimeUnit
-from carlasc_converters.transforms import FrameTrack, FrameTree, PlacedFrame
+from carlasc_converters.transforms import BAD_SHARE, FrameTrack, FrameTree, PlacedFrame, are_poses
 
 _BASES = ("base_link", "base_footprint")  # names of the frame of a vehicle, by ROS' REP 105
+_MOVED = 0.2  # metres, or sine of an angle, by which a LiDAR may move on the vehicle
 _WORLDS = ("odom", "map", "world")  # names of frames that do not move, the smoothest first
 
 
@@ -101,7 +102,8 @@ class BagRecording(Recording):
         self.name = sequence_name(files.paths[0].name.split(".")[0].removesuffix("_0"))
         self._pose_note, self._notes = "", list[str]()
         self._lidars = [
-            LidarTopic(topic, options.time_unit) for topic in files.clouds(options.topics)
+            LidarTopic(topic, options.time_unit, deskewed=options.deskewed)
+            for topic in files.clouds(options.topics)
         ]
 
     @cached_property
@@ -114,11 +116,11 @@ class BagRecording(Recording):
             zip(first.places, first.stamps.tolist(), strict=True)
         ):
             parts = [
-                (0, place, first.unit),
-                *((k, rows[number], others[k - 1].unit) for k, rows in enumerate(near, 1)),
+                (0, place, first.clock),
+                *((k, rows[number], others[k - 1].clock) for k, rows in enumerate(near, 1)),
             ]
             given = tuple(
-                CloudPlace(k, message, unit) for k, message, unit in parts if message is not None
+                CloudPlace(k, message, clock) for k, message, clock in parts if message is not None
             )
             frames.append(BagFrame(number, f"{place}: message {number}", stamp, given))
         return frames
@@ -129,12 +131,15 @@ class BagRecording(Recording):
 
         Raises:
             MissingDataError: there are several, and no transforms between them.
+            FormatError: one moves on the vehicle, or its points are in the frame of the world.
         """
-        tree, at, sensors = self._tree, self._lidars[0].stamps[:1], list[Sensor]()
+        tree, sensors = self._tree, list[Sensor]()
         for lidar in self._lidars:
             if not tree.connected(lidar.frame, self._vehicle):
                 raise self._no_path(lidar.frame, self._vehicle, "convert one LiDAR with `topics`")
-            place = tree.lookup(self._vehicle, lidar.frame, at)[0]
+            place, last = tree.lookup(self._vehicle, lidar.frame, lidar.stamps[[0, -1]])
+            if np.abs(last - place).max() > _MOVED:
+                raise self._in_world(lidar.frame)
             sensors.append(Sensor(lidar.name, place, deskewed=self._options.deskewed))
         return sensors
 
@@ -163,6 +168,8 @@ class BagRecording(Recording):
             where = f"{self.location}: {topic.channel.topic}"
             track = FrameTrack(where)
             for placed in self._placed(topic):
+                if placed.parent == self._lidars[0].frame and not force:
+                    raise self._in_world(placed.parent)
                 track.add(placed)
             if not len(track):
                 raise FormatError(where, expected="poses", found="none that can be read")
@@ -224,7 +231,21 @@ class BagRecording(Recording):
         }
 
     def notes(self) -> list[str]:
-        """Return notes on incomplete files, and on what was assumed."""
+        """Return notes on incomplete files, on what was assumed, and on what is not read."""
+        read = {lidar.name for lidar in self._lidars} | {
+            camera.topic.channel.topic for camera in self._cameras.values() if camera.topic
+        }
+        if self._pose_note:
+            poses = self._files.poses(self._options.pose_topic)
+            read |= {poses.channel.topic} if poses else set()
+        left = [
+            *(name for lidar in self._lidars for name in lidar.unread),
+            *(
+                str(topic)
+                for name, topic in sorted(self._files.topics.items())
+                if name not in read and topic.channel.type not in (*TRANSFORMS, CAMERA_INFO)
+            ),
+        ]
         notes = [
             *self._files.notes(),
             *self._notes,
@@ -241,6 +262,8 @@ class BagRecording(Recording):
                 f"{self.location}: no transforms lead from {self._lidars[0].frame} to "
                 f"{self._unplaced}: both are taken as the same frame"
             )
+        if left:
+            notes.append(f"{self.location}: not read: {', '.join(left)}")
         return list(dict.fromkeys(notes))
 
     @cached_property
@@ -285,16 +308,28 @@ class BagRecording(Recording):
 
         Of a topic of paths, the last message is read, which holds the whole path.
         """
-        places, errors = list(topic.places()), list[FormatError]()
+        places, errors, bad, good = list(topic.places()), list[FormatError](), list[str](), 0
         for place in places[-1:] if topic.channel.type == PATH else places:
             try:
-                yield from read_placed(place.read(), place.channel, str(place))
+                placed = read_placed(place.read(), place.channel, str(place))
             except FormatError as error:
                 errors.append(error)
+                continue
+            bad += (f"{place}: {one.pose}" for one in placed if not are_poses(one.pose))
+            good += len(placed)
+            yield from (one for one in placed if are_poses(one.pose))
         if errors:
             self._notes.append(
                 f"{errors[0]}: so {len(errors)} of {len(places)} messages are left out"
             )
+        if len(bad) > BAD_SHARE * good:
+            raise FormatError(
+                f"{self.location}: {topic.channel.topic}",
+                expected="a position, and a rotation: a quaternion w, x, y, z of length 1",
+                found=f"{len(bad)} of {good} others, such as {bad[0]}",
+            )
+        if bad:
+            self._notes.append(f"{bad[0]} is no pose: {len(bad)} of {good} are left out")
 
     def _poses_of_tree(self, *, required: bool) -> tuple[IntArray, FloatArray] | None:
         """Return times and poses of the vehicle in the world; None if the vehicle does not move in
@@ -326,6 +361,14 @@ class BagRecording(Recording):
         expected = f"transforms from {frame} to {target}"
         return MissingDataError(
             self.location, expected=expected, found=f"only {self._tree}", advice=advice
+        )
+
+    def _in_world(self, frame: str) -> FormatError:
+        return FormatError(
+            self.location,
+            expected="points in a frame that does not move on the vehicle",
+            found=f"the frame {frame}, which does: such as that of the world",
+            advice="convert the topic of points in the frame of the sensor",
         )
 
     def _seconds(self, stamps: IntArray) -> FloatArray:

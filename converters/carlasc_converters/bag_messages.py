@@ -14,8 +14,6 @@ https://github.com/Livox-SDK/livox_ros_driver2.
 from __future__ import annotations
 
 import sys
-from bz2 import decompress
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 from struct import unpack_from
@@ -27,10 +25,19 @@ from carlasc.core.arrays import AnyArray
 from carlasc.core.geometry import Transform
 from carlasc.errors import FormatError, import_extra, reading
 from carlasc_converters import foxglove_messages
+from carlasc_converters.files import MAX_UNPACKED, check_size
 from carlasc_converters.point_fields import TimeUnit, read_columns, unpack_fields
 from carlasc_converters.transforms import PlacedFrame, poses_of
 
 EXTRA = "bags"
+_CODECS = {
+    "bz2": ("bz2", "BZ2Decompressor"),
+    "lz4": ("lz4.frame", "LZ4FrameDecompressor"),
+    "zstd": (
+        "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd",
+        "ZstdDecompressor",
+    ),
+}
 PLACE = np.dtype([("time", "<i8"), ("chunk", "<i8"), ("offset", "<i8")])
 """The position of a message: time of its recording, nanoseconds; start of its chunk, -1 without
 one; its place in the chunk or file.
@@ -84,37 +91,53 @@ def ros_type(name: str) -> str:
     return name if "/" in kind or not slash else f"{package}/msg/{kind}"
 
 
-def decompressed(data: bytes, codec: str, where: str) -> bytes:
+def decompressed(data: bytes, codec: str, where: str, size: int = MAX_UNPACKED) -> bytes:
     """Return the content of a chunk.
 
+    Args:
+        data: the chunk.
+        codec: its compression; empty or "none" without one.
+        where: the file, for errors.
+        size: the greatest number of bytes of the content.
+
     Raises:
-        FormatError: the codec is not known, or the chunk is damaged.
+        FormatError: the codec is not known, the chunk is damaged, or has more bytes.
         DependencyError: the codec is not installed.
     """
     if codec in ("", "none"):
         return data
-    if codec not in ("bz2", "lz4", "zstd"):
+    if codec not in _CODECS:
         raise FormatError(
             where,
             expected="chunks that are not compressed, or with bz2, lz4 or zstd",
             found=repr(codec),
             advice="write the bag again with one of these",
         )
-    zstd = "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd"
-    unpack: Callable[[bytes], bytes] = (
-        decompress
-        if codec == "bz2"
-        else import_extra("lz4.frame" if codec == "lz4" else zstd, EXTRA).decompress
-    )
+    module, name = _CODECS[codec]
+    decoder = getattr(import_extra(module, EXTRA), name)
+    check_size(size, where)
+    parts, left = list[bytes](), size
     try:
-        return unpack(data)
+        while data and left >= 0:  # a chunk may be several streams
+            stream = decoder()
+            parts.append(stream.decompress(data, max_length=left + 1))
+            left -= len(parts[-1])
+            if left >= 0 and not stream.eof:
+                raise EOFError("cut short")
+            data = stream.unused_data
     except Exception as error:  # each codec has its own errors
         raise FormatError(
             where, expected=f"a chunk compressed with {codec}", found=f"damage ({error})"
         ) from error
+    if left < 0:
+        raise FormatError(
+            where, expected=f"a chunk of {size} bytes, compressed with {codec}", found="more"
+        )
+    return b"".join(parts)
 
 
-_LIVOX = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
+_PACKAGES = ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
+_LIVOX = tuple(f"{package}/msg/CustomMsg" for package in _PACKAGES)
 PATH = "nav_msgs/msg/Path"
 CLOUDS = ("sensor_msgs/msg/PointCloud2", *_LIVOX, "foxglove.PointCloud")
 POSES = (
@@ -145,13 +168,13 @@ _CUSTOM_TEXT = (
 )
 _TEXTS = dict.fromkeys(TRANSFORMS[:2], _TRANSFORM_TEXT) | {
     f"{package}/msg/{name}": text
-    for package in ("livox_ros_driver", "livox_ros_driver2")
+    for package in _PACKAGES
     for name, text in (("CustomPoint", _POINT_TEXT), ("CustomMsg", _CUSTOM_TEXT))
 }
 _POINT = np.dtype(
     {
-        "names": ["offset_time", "x", "y", "z", "reflectivity", "tag", "line"],
-        "formats": ["u4", "f4", "f4", "f4", "u1", "u1", "u1"],
+        "names": "offset_time x y z reflectivity tag line".split(),
+        "formats": "u4 f4 f4 f4 u1 u1 u1".split(),
     }
 )
 _ENCODINGS = {"ros1": "ros", "cdr": "ros", "protobuf": "foxglove", "json": "foxglove"}

@@ -4,13 +4,12 @@ cameras, with projections from CameraInfo and images of the same namespace.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting.protocol import Cloud, FrameHandle
 from carlasc.core import CameraModel
@@ -30,13 +29,19 @@ from carlasc_converters.bag_messages import (
 )
 from carlasc_converters.bag_topics import BagFiles, MessagePlace, Topic
 from carlasc_converters.image_files import nearest_rows
-from carlasc_converters.point_fields import TimeUnit, named_fields, point_seconds
+from carlasc_converters.point_fields import (
+    TIMES,
+    PointClock,
+    TimeUnit,
+    check_near,
+    find_clock,
+    named_fields,
+    returns,
+    unread,
+)
 
 _PACKETS_HZ = 150  # messages that are more frequent are packets, because no LiDAR turns so fast
-_OWN_CLOCK_S = (
-    1.0  # times of points that differ more from the time of the message are from another clock
-)
-_PROBES = 5  # number of messages from which the unit of the times of points is found
+_PROBES = 5  # first messages that say, with the last one, what the times of points are
 
 
 class LidarTopic:
@@ -46,8 +51,9 @@ class LidarTopic:
         name: of the topic.
     """
 
-    def __init__(self, topic: Topic, time_unit: TimeUnit) -> None:
+    def __init__(self, topic: Topic, time_unit: TimeUnit, *, deskewed: bool) -> None:
         self.name, self._topic, self._time_unit = topic.channel.topic, topic, time_unit
+        self._deskewed = deskewed
         self.notes: list[str] = []
         gaps = np.diff(np.sort(topic.times)) / 1e9
         if len(gaps) >= _PROBES and (period := float(np.median(gaps))) * _PACKETS_HZ < 1:
@@ -99,46 +105,57 @@ class LidarTopic:
     @cached_property
     def frame(self) -> str:
         """The frame of the sensor."""
-        return next(self._readable()).frame
+        return self._probes[0].frame
 
-    def _readable(self) -> Iterator[CloudMessage]:
-        """Yield the first messages that can be read.
+    @cached_property
+    def _probes(self) -> list[CloudMessage]:
+        """The first messages that can be read, and the last one.
 
         Raises:
             FormatError: no message can be read.
         """
-        problem, count = None, 0
-        for place in self.places:
-            try:
-                yield read_cloud(place.read(), place.channel, str(place))
-                count += 1
-            except FormatError as error:
-                problem = problem or error
-            if count == _PROBES:
-                return
-        if problem is not None and not count:
+        problem, messages = None, list[CloudMessage]()
+        for places in (self.places, self.places[: -_PROBES - 1 : -1]):
+            for place in places:
+                try:
+                    messages.append(read_cloud(place.read(), place.channel, str(place)))
+                except FormatError as error:
+                    problem = problem or error
+                if len(messages) >= _PROBES:
+                    break
+        if problem is not None and not messages:
             raise problem
+        return messages
 
     @cached_property
-    def unit(self) -> TimeUnit:
-        """The unit of the times of points, from the first messages; "auto" without times."""
-        if self._time_unit != "auto":
-            return self._time_unit
-        problem: FormatError | None = None
-        for message in self._readable():
-            fields = named_fields(message.columns, self.name)
-            if "time" not in fields or not np.any(fields["time"]):
-                continue
-            try:
-                unit = message.time_unit or point_seconds(fields["time"], "auto", self.name)[2]
-            except FormatError as error:
-                problem = error
-            else:
-                self.notes.append(f"{self.name}: the times of points are in {unit}")
-                return unit
-        if problem is not None:
-            raise problem
-        return "auto"
+    def clock(self) -> PointClock | None:
+        """How the times of points are found, from some messages; None without times.
+
+        Raises:
+            FormatError: they are not the times of a scan.
+        """
+        given, scans = self._time_unit, [(one.columns, one.stamp_ns) for one in self._probes]
+        unit = (self._probes[0].time_unit or "auto") if given == "auto" else given
+        clock = find_clock(scans, unit, self.name, needed=not self._deskewed)
+        if clock is None:
+            if set(TIMES) & {name.lower() for name in self._probes[0].columns}:
+                self.notes.append(
+                    f"{self.name}: the times of the points of a message do not differ: points are "
+                    f"not corrected for the motion of the vehicle"
+                )
+        elif given == "auto":
+            self.notes.append(f"{self.name}: the times of points are in {clock.unit}")
+        if clock is not None and clock.own:
+            self.notes.append(
+                f"{self.name}: the times of points are of another clock than those of the "
+                f"messages, which are taken as the times of the first points"
+            )
+        return clock
+
+    @property
+    def unread(self) -> list[str]:
+        """The fields that are not read, each with the topic."""
+        return [f"{name} of {self.name}" for name in unread(self._probes[0].columns, self.clock)]
 
     def nearest(self, stamps: IntArray) -> list[MessagePlace | None]:
         """Return the message nearest to each time; None if it is farther away than the interval of
@@ -166,12 +183,12 @@ class CloudPlace:
     Attributes:
         sensor: index of the LiDAR.
         place: its message.
-        unit: unit of the times of points.
+        clock: how the times of points are found; None if they have none.
     """
 
     sensor: int
     place: MessagePlace
-    unit: TimeUnit
+    clock: PointClock | None
 
 
 @dataclass(frozen=True)
@@ -193,37 +210,32 @@ class BagFrame(FrameHandle):
 
         Points that are NaN or at the origin are no returns, and left out.
         """
-        return [self._read(cloud) for cloud in self.clouds]
+        clouds = []
+        for cloud in self.clouds:  # in Python 3.11, a comprehension is a level of calls
+            clouds.append(self._read(cloud))  # noqa: PERF401
+        return clouds
 
     def _read(self, cloud: CloudPlace) -> Cloud:
         where = str(cloud.place)
         message = read_cloud(cloud.place.read(), cloud.place.channel, where)
-        fields = named_fields(message.columns, where)
-        points = fields["points"]
-        seen = np.isfinite(points[:, :3]).all(axis=1) & points[:, :3].any(axis=1)
+        points = named_fields(message.columns, where)["points"]
+        seen = returns(message.columns)
         if not seen.any():
             raise FormatError(self.location, expected="points", found="none")
-        points = points[seen]
+        points, seconds = points[seen], None
         if message.pose is not None:
             points[:, :3] = transform_points(message.pose, points[:, :3])
+        check_near(points, where)
         points[:, 3] = np.nan_to_num(points[:, 3])
-        seconds = self._seconds_of(message, fields.get("time"), cloud.unit, where)
-        return Cloud(
-            points, seconds=None if seconds is None else seconds[seen], sensor=cloud.sensor
-        )
-
-    def _seconds_of(
-        self, message: CloudMessage, times: NDArray[np.generic] | None, unit: TimeUnit, where: str
-    ) -> FloatArray | None:
-        """Return the time of each point after the time of the frame; None if it is not known."""
+        if cloud.clock is not None:
+            seconds = cloud.clock.seconds(message.columns, seen, message.stamp_ns, where)
+        # the message of another sensor has another time than the frame
         late = (message.stamp_ns - self.stamp_ns) * 1e-9
-        if times is None:
-            return np.full(len(next(iter(message.columns.values()))), late) if late else None
-        seconds, start_ns, _ = point_seconds(times, unit, where)
-        if start_ns is not None:
-            after = (start_ns - message.stamp_ns) * 1e-9
-            seconds = seconds + (after if abs(after) < _OWN_CLOCK_S else 0.0)
-        return seconds + late
+        if seconds is not None:
+            seconds = seconds[seen] + late
+        elif late:
+            seconds = np.full(len(points), late)
+        return Cloud(points, seconds=seconds, sensor=cloud.sensor)
 
 
 _MODELS: dict[str, tuple[Lens, tuple[int, ...]]] = {

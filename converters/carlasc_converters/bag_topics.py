@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import atexit
 import re
+import tempfile
+import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
+from shutil import disk_usage
 from types import ModuleType
 
 import numpy as np
@@ -23,7 +27,7 @@ from carlasc_converters.bag_messages import (
     decompressed,
     is_readable,
 )
-from carlasc_converters.files import opening
+from carlasc_converters.files import opening, raw_advice
 
 _KINDS = (ros1_bag, mcap_file, db3_file)
 _ENDINGS = (".bag", ".bag.active", ".mcap", ".db3")
@@ -221,6 +225,8 @@ def find_bags(source: Path) -> list[list[Path]]:
     Raises:
         MissingDataError: no file exists.
     """
+    if source.suffix.lower() == ".zip" and source.is_file():
+        source = _unzipped(source)
     if source.is_file():
         return [[source]]
     patterns = (
@@ -234,7 +240,9 @@ def find_bags(source: Path) -> list[list[Path]]:
             source,
             expected=_EXPECTED,
             found=packed or ("none" if source.is_dir() else "no such folder"),
-            advice=f"unpack it with `zstd -d {packed}`" if packed else "check the path",
+            advice=f"unpack it with `zstd -d {packed}`"
+            if packed
+            else raw_advice(path.name for path in source.glob("*")) or "check the path",
         )
     groups: dict[tuple[Path, str], list[tuple[int, Path]]] = {}
     for path in bags:
@@ -248,6 +256,28 @@ def find_bags(source: Path) -> list[list[Path]]:
     return recordings
 
 
+@cache
+def _unzipped(path: Path) -> Path:
+    """Return a temporary folder with the bags of a zip archive, until this process ends.
+
+    Raises:
+        FormatError: it is damaged, or there is not enough space for it.
+    """
+    folder = tempfile.TemporaryDirectory(prefix="carlasc-")
+    atexit.register(folder.cleanup)
+    with opening(path, "a zip archive of bags"), zipfile.ZipFile(path) as archive:
+        size, free = sum(entry.file_size for entry in archive.infolist()), disk_usage(folder.name)
+        if size > free.free:
+            raise FormatError(
+                path,
+                expected=f"at most {free.free >> 20:,} MiB, the free space in {folder.name}",
+                found=f"{size >> 20:,} MiB",
+                advice="unpack it, and give the folder",
+            )
+        archive.extractall(folder.name)
+    return Path(folder.name)
+
+
 def _kind_of(path: Path) -> ModuleType:
     """Return the module that reads a file, by its first bytes.
 
@@ -259,7 +289,11 @@ def _kind_of(path: Path) -> ModuleType:
         head = file.read(16)
     kind = next((kind for kind in _KINDS if head.startswith(kind.MAGIC)), None)
     if kind is None:
-        advice = f"unpack it with `zstd -d {path.name}`" if path.name.endswith(_PACKED) else ""
+        advice = (
+            f"unpack it with `zstd -d {path.name}`"
+            if path.name.endswith(_PACKED)
+            else raw_advice([path.name])
+        )
         raise FormatError(path, expected=_EXPECTED, found="another kind of file", advice=advice)
     return kind
 

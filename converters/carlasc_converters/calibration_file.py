@@ -18,14 +18,9 @@ from carlasc_converters.transforms import poses_of
 _EXPECTED = (
     "sensors, each with translation (x, y, z) and rotation (qx, qy, qz, qw), or with matrix (4 x 4)"
 )
-_DIRECTIONS = {
-    "f": (1, 0, 0),
-    "b": (-1, 0, 0),
-    "l": (0, 1, 0),
-    "r": (0, -1, 0),
-    "u": (0, 0, 1),
-    "d": (0, 0, -1),
-}
+_DIRECTIONS = dict(
+    zip("flubrd", (np.concatenate([np.eye(3), -np.eye(3)]) + 0.0).tolist(), strict=True)
+)
 
 
 def read_calibration(path: Path) -> dict[str, Transform]:

@@ -5,7 +5,7 @@ that name the file.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,6 +16,17 @@ from carlasc.storage.arrays import ArrayFormat, open_npz
 from carlasc.storage.files import AnyPath
 
 COPY = "the file may be cut short: copy it again"
+_RAW = {
+    "pcap": "pcap files hold packets of a LiDAR: convert them to PCD, LAS or a bag with the tool "
+    "of its maker (Ouster: `ouster-cli`, Velodyne: VeloView, Hesai: PandarView, RoboSense: RSView, "
+    "Livox: Livox Viewer), or replay them with its ROS driver and record its topic of points",
+    "osf": "convert OSF to PCD, LAS or a bag with `ouster-cli source FILE save` of ouster-sdk",
+    "lvx": "convert LVX to LAS, PCD or a bag with Livox Viewer or livox_ros_driver",
+    "e57": "convert E57 to LAS or PLY with CloudCompare or `pdal translate`, a file for each scan",
+}
+_RAW |= {"pcapng": _RAW["pcap"], "lvx2": _RAW["lvx"]}
+MAX_UNPACKED = 1 << 28
+"""Greatest number of bytes that one compressed chunk, message or scan is unpacked to."""
 _OF_THE_LAYOUT = {*layout.scan_folders(), *layout.SPLITS, *layout.COORDINATES, layout.EVALUATION}
 _MISSING = "check the path, or unpack the archive that contains it"
 
@@ -40,6 +51,27 @@ def opening(path: AnyPath, expected: str, advice: str = COPY) -> Iterator[None]:
             raise MissingDataError(
                 path, expected=expected, found="nothing", advice=_MISSING
             ) from None
+
+
+def raw_advice(names: Iterable[str]) -> str:
+    """Return what to do with recordings in a format of a maker's tool; empty without one."""
+    endings = {name.lower().rpartition(".")[2] for name in names}
+    return "; ".join(text for ending, text in _RAW.items() if ending in endings)
+
+
+def check_size(size: int, where: AnyPath) -> None:
+    """Check the bytes that a compressed part of a file says it contains, before it is unpacked.
+
+    Raises:
+        FormatError: they are more than any scan or chunk has.
+    """
+    if size > MAX_UNPACKED:
+        raise FormatError(
+            where,
+            expected=f"compressed parts of at most {MAX_UNPACKED >> 20} MiB",
+            found=f"one of {size >> 20:,} MiB",
+            advice="the file is damaged; if not, write it again without compression",
+        )
 
 
 def sequence_name(name: str) -> str:

@@ -9,34 +9,30 @@ import numpy as np
 
 from carlasc.core.arrays import FloatArray
 from carlasc.core.boxes import Boxes
-from carlasc.core.classes import ClassTable, Color, Remap
-from carlasc.core.tables import CARLA
 from carlasc.errors import FormatError
+from carlasc_converters.class_rows import class_rows, tables_of
 
-_CLASSES: tuple[tuple[str, Color, int], ...] = (  # name, colour, id of CARLA; ids in order
-    ("unlabeled", (255, 255, 255), 0),
-    ("ground", (128, 64, 128), 14),
-    ("geometry", (110, 190, 160), 3),
-    ("Car", (0, 0, 142), 10),
-    ("Van", (60, 90, 230), 10),
-    ("Truck", (0, 0, 70), 10),
-    ("Pedestrian", (220, 20, 60), 4),
-    ("Person_sitting", (150, 20, 90), 4),
-    ("Cyclist", (240, 70, 190), 4),
-    ("Tram", (0, 80, 100), 10),
-    ("Misc", (170, 120, 50), 10),  # mostly trailers
-)
-KITTI = ClassTable(
+# name, colour, class of CARLA; ids in order; `Misc` are mostly trailers
+_CLASSES = class_rows("""
+    unlabeled 255 255 255 Free
+    ground 128 64 128 Ground
+    geometry 110 190 160 Other
+    Car 0 0 142 Vehicle
+    Van 60 90 230 Vehicle
+    Truck 0 0 70 Vehicle
+    Pedestrian 220 20 60 Pedestrian
+    Person_sitting 150 20 90 Pedestrian
+    Cyclist 240 70 190 Pedestrian
+    Tram 0 80 100 Vehicle
+    Misc 170 120 50 Vehicle
+""")
+KITTI, KITTI_TO_CARLA = tables_of(
     "kitti",
-    {i: name for i, (name, _, _) in enumerate(_CLASSES)},
-    {i: color for i, (_, color, _) in enumerate(_CLASSES)},
+    _CLASSES,
     movable=frozenset(range(3, len(_CLASSES))),
     deformable=frozenset({6, 7}),
     ground=frozenset({1}),
     geometry_only=2,
-)
-KITTI_TO_CARLA = Remap(
-    "kitti_to_carla", KITTI, CARLA, {i: carla for i, (_, _, carla) in enumerate(_CLASSES)}
 )
 
 ONLY_IN_VIEW = "boxes exist only in the view of the front camera: elsewhere, objects have no boxes"

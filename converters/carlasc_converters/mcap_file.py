@@ -176,7 +176,9 @@ def _read_chunk(path: str, at: int, version: Version) -> bytes:
             path, expected=f"a chunk at byte {at}", found=f"damage ({error})"
         ) from error
     data, (checksum,) = (
-        decompressed(content[begin + 8 : begin + 8 + length], codec, path),
+        decompressed(
+            content[begin + 8 : begin + 8 + length], codec, path, unpack_from("<Q", content, 16)[0]
+        ),
         unpack_from("<I", content, 24),
     )
     if checksum and crc32(data) != checksum:

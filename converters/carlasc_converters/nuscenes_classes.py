@@ -4,51 +4,50 @@ those of its boxes.
 
 from __future__ import annotations
 
-from carlasc.core.classes import ClassTable, Color, Remap
-from carlasc.core.tables import CARLA
+from carlasc_converters.class_rows import class_rows, tables_of
 
-# name in category.json, colour, class of CARLA; ids in order
-_CLASSES: tuple[tuple[str, Color, str], ...] = (
-    ("noise", (0, 0, 0), "Free"),  # returns from dust, rain and reflections: unlabelled
-    ("animal", (70, 130, 180), "Dynamic"),
-    ("human.pedestrian.adult", (0, 0, 230), "Pedestrian"),
-    ("human.pedestrian.child", (135, 206, 235), "Pedestrian"),
-    ("human.pedestrian.construction_worker", (100, 149, 237), "Pedestrian"),
-    ("human.pedestrian.personal_mobility", (219, 112, 147), "Pedestrian"),
-    ("human.pedestrian.police_officer", (0, 0, 128), "Pedestrian"),
-    ("human.pedestrian.stroller", (240, 128, 128), "Pedestrian"),
-    ("human.pedestrian.wheelchair", (138, 43, 226), "Pedestrian"),
-    ("movable_object.barrier", (112, 128, 144), "GuardRail"),
-    ("movable_object.debris", (210, 105, 30), "Dynamic"),
-    ("movable_object.pushable_pullable", (105, 105, 105), "Dynamic"),
-    ("movable_object.trafficcone", (47, 79, 79), "Static"),
-    ("static_object.bicycle_rack", (188, 143, 143), "Static"),
-    ("vehicle.bicycle", (220, 20, 60), "Vehicle"),
-    ("vehicle.bus.bendy", (255, 127, 80), "Vehicle"),
-    ("vehicle.bus.rigid", (255, 69, 0), "Vehicle"),
-    ("vehicle.car", (255, 158, 0), "Vehicle"),
-    ("vehicle.construction", (233, 150, 70), "Vehicle"),
-    ("vehicle.emergency.ambulance", (255, 83, 0), "Vehicle"),
-    ("vehicle.emergency.police", (255, 215, 0), "Vehicle"),
-    ("vehicle.motorcycle", (255, 61, 99), "Vehicle"),
-    ("vehicle.trailer", (255, 140, 0), "Vehicle"),
-    ("vehicle.truck", (255, 99, 71), "Vehicle"),
-    ("flat.driveable_surface", (0, 207, 191), "Road"),
-    ("flat.other", (175, 0, 75), "Ground"),
-    ("flat.sidewalk", (75, 0, 75), "Sidewalk"),
-    ("flat.terrain", (112, 180, 60), "Terrain"),
-    ("static.manmade", (222, 184, 135), "Building"),
-    ("static.other", (255, 228, 196), "Other"),
-    ("static.vegetation", (0, 175, 0), "Vegetation"),
-    ("vehicle.ego", (255, 240, 245), "Free"),  # the recording vehicle does not belong to the scene
-)
+# name in category.json, colour, class of CARLA; ids in order. Noise is unlabelled: returns from
+# dust, rain and reflections. The recording vehicle (`vehicle.ego`) does not belong to the scene.
+_CLASSES = class_rows("""
+    noise 0 0 0 Free
+    animal 70 130 180 Dynamic
+    human.pedestrian.adult 0 0 230 Pedestrian
+    human.pedestrian.child 135 206 235 Pedestrian
+    human.pedestrian.construction_worker 100 149 237 Pedestrian
+    human.pedestrian.personal_mobility 219 112 147 Pedestrian
+    human.pedestrian.police_officer 0 0 128 Pedestrian
+    human.pedestrian.stroller 240 128 128 Pedestrian
+    human.pedestrian.wheelchair 138 43 226 Pedestrian
+    movable_object.barrier 112 128 144 GuardRail
+    movable_object.debris 210 105 30 Dynamic
+    movable_object.pushable_pullable 105 105 105 Dynamic
+    movable_object.trafficcone 47 79 79 Static
+    static_object.bicycle_rack 188 143 143 Static
+    vehicle.bicycle 220 20 60 Vehicle
+    vehicle.bus.bendy 255 127 80 Vehicle
+    vehicle.bus.rigid 255 69 0 Vehicle
+    vehicle.car 255 158 0 Vehicle
+    vehicle.construction 233 150 70 Vehicle
+    vehicle.emergency.ambulance 255 83 0 Vehicle
+    vehicle.emergency.police 255 215 0 Vehicle
+    vehicle.motorcycle 255 61 99 Vehicle
+    vehicle.trailer 255 140 0 Vehicle
+    vehicle.truck 255 99 71 Vehicle
+    flat.driveable_surface 0 207 191 Road
+    flat.other 175 0 75 Ground
+    flat.sidewalk 75 0 75 Sidewalk
+    flat.terrain 112 180 60 Terrain
+    static.manmade 222 184 135 Building
+    static.other 255 228 196 Other
+    static.vegetation 0 175 0 Vegetation
+    vehicle.ego 255 240 245 Free
+""")
 CLASS_IDS = {name: index for index, (name, _, _) in enumerate(_CLASSES)}
 """Class id of each category."""
 
-NUSCENES = ClassTable(
+NUSCENES, TO_CARLA = tables_of(
     "nuscenes",
-    {index: name for name, index in CLASS_IDS.items()},
-    {index: color for index, (_, color, _) in enumerate(_CLASSES)},
+    _CLASSES,
     movable=frozenset(
         {*range(1, 9), CLASS_IDS["movable_object.pushable_pullable"], *range(14, 24)}
     ),
@@ -56,12 +55,6 @@ NUSCENES = ClassTable(
     ground=frozenset(range(24, 28)),
     geometry_only=CLASS_IDS["static.other"],
     ground_only=CLASS_IDS["flat.other"],
-)
-TO_CARLA = Remap(
-    "nuscenes_to_carla",
-    NUSCENES,
-    CARLA,
-    {index: CARLA.id_of(target) for index, (_, _, target) in enumerate(_CLASSES)},
 )
 
 VALIDATION = frozenset(

@@ -13,10 +13,10 @@ from typing import BinaryIO
 
 import numpy as np
 
-from carlasc.core.arrays import AnyArray, Uint8Array
+from carlasc.core.arrays import AnyArray, RecordArray, Uint8Array
 from carlasc.core.compiling import cached
 from carlasc.errors import FormatError
-from carlasc_converters.files import COPY, opening
+from carlasc_converters.files import COPY, check_size, opening
 
 _MAX_LINE = 4096
 _LONGEST_LITERAL = 32  # LZF: after a control byte n below this value, n + 1 literal bytes follow
@@ -32,11 +32,24 @@ class PcdHeader:
             name here.
         points: number of points.
         encoding: "ascii", "binary" or "binary_compressed".
+        viewpoint: x, y, z, and the quaternion w, x, y, z of the sensor, in the frame of the points.
     """
 
     row: np.dtype[np.void]
     points: int
     encoding: str
+    viewpoint: tuple[float, ...] = (0, 0, 0, 1, 0, 0, 0)
+
+
+def read_header(path: str | Path) -> PcdHeader:
+    """Return the header of a PCD file.
+
+    Raises:
+        MissingDataError: the file does not exist.
+        FormatError: it is not a PCD file.
+    """
+    with opening(path, "a PCD file"), Path(path).open("rb") as file:
+        return _read_header(file, str(path))
 
 
 def read_pcd(path: str | Path) -> dict[str, AnyArray]:
@@ -53,11 +66,7 @@ def read_pcd(path: str | Path) -> dict[str, AnyArray]:
     where, row, count = str(path), header.row, header.points
     if header.encoding == "ascii":
         try:
-            rows = (
-                np.loadtxt(io.BytesIO(body), row, comments=None, ndmin=1)
-                if body.strip()
-                else np.empty(0, row)
-            )
+            rows = _rows_of_text(body, row) if body.strip() else np.empty(0, row)
         except ValueError as error:
             raise FormatError(
                 where, expected=f"{count} rows of numbers", found=f"others ({error})", advice=COPY
@@ -109,13 +118,22 @@ def _read_header(file: BinaryIO, where: str) -> PcdHeader:
         (encoding,) = entries["DATA"]
         if encoding not in ("ascii", "binary", "binary_compressed") or points < 0:
             raise ValueError(f"DATA {encoding}, {points} points")
-        return PcdHeader(np.dtype(fields), points, encoding)
+        viewpoint = tuple(map(float, entries.get("VIEWPOINT", ())))
+        return PcdHeader(np.dtype(fields), points, encoding, viewpoint or PcdHeader.viewpoint)
     except (KeyError, ValueError, TypeError, IndexError) as error:
         raise FormatError(
             where,
             expected="FIELDS, SIZE, TYPE, COUNT, POINTS and DATA of a PCD file",
             found=f"others ({error})",
         ) from error
+
+
+def _rows_of_text(body: bytes, row: np.dtype[np.void]) -> RecordArray:
+    """Return the rows of a text body."""
+    try:
+        return np.loadtxt(io.BytesIO(body), row, comments=None, ndmin=1)
+    except ValueError:  # whole numbers may be written as in 1.5e+03
+        return np.loadtxt(io.BytesIO(body), row, comments=None, ndmin=1, converters=float)
 
 
 def _unpacked(body: bytes, row: np.dtype[np.void], count: int, where: str) -> bytes:
@@ -128,6 +146,7 @@ def _unpacked(body: bytes, row: np.dtype[np.void], count: int, where: str) -> by
         raise FormatError(
             where, expected=expected, found=f"{len(body) - 8} bytes of {size}", advice=COPY
         )
+    check_size(size, where)
     columns = np.empty(size, np.uint8)
     if _lzf(np.frombuffer(body, np.uint8, packed, 8), columns) != size:
         raise FormatError(

@@ -9,15 +9,15 @@ properties; the rows of the elements follow.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import islice
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
 import numpy as np
 
-from carlasc.core.arrays import RecordArray
+from carlasc.core.arrays import IntArray, RecordArray
 from carlasc.errors import FormatError
 from carlasc.storage.files import AnyPath
 from carlasc_converters.files import opening
@@ -45,6 +45,9 @@ class PlyVertices:
         offset: where the body of the file begins, or, for a binary file, the first vertex.
         lines: for a text file, the number of lines of its body before the first vertex; None for a
             binary file.
+        starts: (count + 1,) where each vertex of a binary file begins, if vertices have lists; of
+            these, the properties before the first list are read.
+        lists: whether vertices have lists.
     """
 
     path: str
@@ -52,6 +55,8 @@ class PlyVertices:
     count: int
     offset: int
     lines: int | None = None
+    starts: IntArray | None = None
+    lists: bool = False
 
     @classmethod
     def open(cls, path: AnyPath, required: tuple[str, ...] = ()) -> Self:
@@ -63,14 +68,16 @@ class PlyVertices:
 
         Raises:
             MissingDataError: the file does not exist.
-            FormatError: it is not a PLY file, its vertices have a list property or lack a required
-                one, or it is shorter than its header says.
+            FormatError: it is not a PLY file, its vertices lack a required property, or it is
+                shorter than its header says.
         """
         with opening(path, "a PLY file"), Path(path).open("rb") as file:
             kind, elements = _read_header(file, str(path))
             offset = file.tell()
-        before = _before_vertices(elements, str(path))
-        dtype = _row_type(elements["vertex"][1], _BYTE_ORDERS[kind], str(path))
+        count, properties = elements["vertex"]
+        before = list(elements.values())[: list(elements).index("vertex")]
+        order, lists = _BYTE_ORDERS[kind], not all(map(_is_single, properties))
+        dtype = _row_type(list(takewhile(_is_single, properties)), order, str(path))
         if missing := [name for name in required if name not in (dtype.names or ())]:
             raise FormatError(
                 path,
@@ -79,19 +86,15 @@ class PlyVertices:
                 advice="check the data set: the file belongs to another one, or to another version",
             )
         if kind == "ascii":
-            return cls(
-                str(path),
-                dtype,
-                elements["vertex"][0],
-                offset,
-                sum(elements[name][0] for name in before),
-            )
-        start = offset + sum(
-            elements[name][0] * _row_type(elements[name][1], "<", str(path)).itemsize
-            for name in before
-        )
-        vertices = cls(str(path), dtype, elements["vertex"][0], start)
-        size = Path(path).stat().st_size
+            skipped = sum(rows for rows, _ in before)
+            return cls(str(path), dtype, count, offset, skipped, lists=lists)
+        start, size = offset, Path(path).stat().st_size
+        for element in before:
+            start = int(_starts(str(path), start, element, order)[-1])
+        vertices = cls(str(path), dtype, count, start)
+        if lists:
+            starts = _starts(str(path), start, elements["vertex"], order)
+            return replace(vertices, starts=starts)
         if size < start + vertices.count * dtype.itemsize:
             found = max(0, size - start) // dtype.itemsize
             raise FormatError(
@@ -133,6 +136,9 @@ class PlyVertices:
         start, stop, _ = slice(start, stop).indices(self.count)
         if stop <= start:
             return np.empty(0, self.dtype)
+        if self.starts is not None:
+            places = self.starts[start:stop, None] + np.arange(self.dtype.itemsize)
+            return np.memmap(self.path, np.uint8, "r")[places].view(self.dtype)[:, 0]
         return np.memmap(
             self.path, self.dtype, "r", self.offset + start * self.dtype.itemsize, (stop - start,)
         )
@@ -151,13 +157,13 @@ class PlyVertices:
             return
         with Path(self.path).open("rb") as binary:
             binary.seek(self.offset)
-            text = io.TextIOWrapper(binary, encoding="ascii")
+            text = filter(str.strip, io.TextIOWrapper(binary, encoding="ascii"))
             for _ in islice(text, self.lines):
                 pass
             for start in range(0, self.count, size):
                 yield self._parse(text, start, min(size, self.count - start))
 
-    def _parse(self, text: io.TextIOWrapper, start: int, count: int) -> RecordArray:
+    def _parse(self, text: Iterable[str], start: int, count: int) -> RecordArray:
         """Return the vertices of the next `count` lines.
 
         `numpy.loadtxt` with a structured type is the fastest parser without another package: 1.2
@@ -166,8 +172,10 @@ class PlyVertices:
         """
         try:
             lines = list(islice(text, count))
+            # a list may follow
+            columns = range(len(self.dtype.names or ())) if self.lists else None
             rows = (
-                np.loadtxt(lines, self.dtype, comments=None, ndmin=1)
+                np.loadtxt(lines, self.dtype, comments=None, ndmin=1, usecols=columns)
                 if lines
                 else np.empty(0, self.dtype)
             )
@@ -189,7 +197,7 @@ class PlyVertices:
         return rows
 
 
-# (name, type), in the order of the file; a list's type is "list"
+# (name, type), in the order of the file; the type of a list are those of its length and its items
 _Properties = list[tuple[str, str]]
 
 
@@ -212,8 +220,8 @@ def _read_header(file: BinaryIO, path: str) -> tuple[str, dict[str, tuple[int, _
                     kind = name
                 case ["element", name, count] if int(count) >= 0:
                     elements[name] = (int(count), [])
-                case ["property", "list", _, _, name]:
-                    elements[next(reversed(elements))][1].append((name, "list"))
+                case ["property", "list", length, item, name] if {length, item} <= _TYPES.keys():
+                    elements[next(reversed(elements))][1].append((name, f"{length} {item}"))
                 case ["property", type_name, name]:
                     elements[next(reversed(elements))][1].append((name, type_name))
                 case ["end_header"]:
@@ -236,23 +244,43 @@ def _read_header(file: BinaryIO, path: str) -> tuple[str, dict[str, tuple[int, _
     return kind, elements
 
 
-def _before_vertices(elements: dict[str, tuple[int, _Properties]], path: str) -> list[str]:
-    """Return the names of the elements before the vertices."""
-    names = list(elements)
-    before = names[: names.index("vertex")]
-    for name in before:
-        if any(kind == "list" for _, kind in elements[name][1]):
+def _is_single(entry: tuple[str, str]) -> bool:
+    """Whether a property is one number, not a list."""
+    return " " not in entry[1]
+
+
+def _starts(path: str, start: int, element: tuple[int, _Properties], order: str) -> IntArray:
+    """Return (count + 1,) where each row of an element of a binary file begins, and the next one.
+
+    Raises:
+        FormatError: the file ends before.
+    """
+    count, properties = element
+    if all(map(_is_single, properties)):
+        size = _row_type(properties, order, path).itemsize
+        return start + size * np.arange(count + 1, dtype=np.int64)
+    sizes = [
+        [np.dtype(_TYPES.get(kind, "V")).itemsize for kind in kinds.split()]
+        for _, kinds in properties
+    ]
+    data, starts = np.memmap(path, np.uint8, "r"), [start]
+    for _ in range(count):
+        for first, *item in sizes:
+            if item:
+                length = data[start : start + first].tobytes()
+                start += item[0] * int.from_bytes(length, "big" if order == ">" else "little")
+            start += first
+        if start > len(data):
             raise FormatError(
-                path, expected="vertices before elements with lists", found=f"{name} before them"
+                path, expected=f"{count} rows with lists", found=str(len(starts) - 1), advice=_CUT
             )
-    return before
+        starts.append(start)
+    return np.array(starts, np.int64)
 
 
 def _row_type(properties: _Properties, byte_order: str, path: str) -> np.dtype[Any]:
     """Return the type of a row with these properties."""
     for name, kind in properties:
-        if kind == "list":
-            raise FormatError(path, expected="one number per property", found=f"the list {name}")
         if kind not in _TYPES:
             raise FormatError(
                 path, expected=f"types {', '.join(_TYPES)}", found=f"{kind} for the property {name}"

@@ -1,10 +1,11 @@
-"""Files of points, one scan each, as columns by name: .bin, .npy, .npz, .csv, .txt, .ply, .pcd,
-.las and .laz.
+"""Files of points, one scan each, as columns by name: .bin, .npy, .npz, .csv, .txt, .xyz, .pts,
+.ply, .pcd, .las and .laz.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,9 @@ from carlasc_converters.ply import PlyVertices
 _FIRST = ("x", "y", "z", "intensity")  # the columns of an array without names
 _MOST_COLUMNS = 12
 _FLOAT = 4
+_FEW = 2000  # values, from which the number of columns is not found
+_ALIKE = 0.5  # rows of the right width are more alike than others by this
+_VALUES = 27720  # of a file are compared; each number of columns up to 12 divides it
 _ARRAY = ArrayFormat(NUMBERS, None, records=True)
 
 
@@ -68,7 +72,31 @@ def _read_bin(path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray
             found=str(len(data)),
             advice=f"check `columns` ({','.join(columns)})",
         )
-    return dict(zip(columns, values.reshape(-1, len(columns)).T, strict=True))
+    width, sample = len(columns), values[:_VALUES]
+    unlike = {
+        number: _unlikeness(sample.reshape(-1, number))
+        for number in {width, *range(3, _MOST_COLUMNS + 1)}
+        if count % number == 0 and len(sample) % number == 0
+    }
+    best = min(unlike, key=unlike.__getitem__, default=width)
+    if best % width and count > _FEW and unlike[best] < _ALIKE * unlike[width]:
+        raise FormatError(
+            path,
+            expected=f"points of {width} columns",
+            found=f"values that fit points of {best}",
+            advice=f"name all {best} columns with `columns`",
+        )
+    return dict(zip(columns, values.reshape(-1, width).T, strict=True))
+
+
+def _unlikeness(rows: AnyArray) -> float:
+    """Return how much the first three columns of successive rows differ, compared with rows that
+    are far apart.
+    """
+    table = np.nan_to_num(np.asarray(rows[:, :3], np.float64))
+    near = np.abs(np.diff(table, axis=0)).mean(axis=0)
+    far = np.abs(table - np.roll(table, len(table) // 3, axis=0)).mean(axis=0)
+    return float((near / np.maximum(far, 1e-9)).max())
 
 
 def _read_npy(path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray]:
@@ -120,13 +148,18 @@ def _named(array: AnyArray, path: Path, columns: tuple[str, ...] | None) -> dict
 def _read_csv(path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray]:
     with opening(path, "a table of numbers"), path.open(encoding="utf-8-sig") as file:
         first = file.readline()
-        separator = "," if "," in first else None
-        words = [word.strip() for word in first.lstrip("#/ ").split(separator)]
-        if named := any(not _is_number(word) for word in words):
+        if path.suffix.lower() == ".pts" and first.strip().isdecimal():
+            first = file.readline()  # after the number of points
+        separator = next((mark for mark in ";," if mark in first), None)
+        words = [word.strip(' \t\r\n"') for word in first.lstrip("#/ ").split(separator)]
+        lines: Iterable[str] = file
+        if separator == ";":
+            lines = (line.replace(",", ".") for line in file)
+        if named := any(not _is_number(word.replace(",", ".")) for word in words):
             columns = tuple(words)
         elif first:
-            file.seek(0)
-        table = np.loadtxt(file, np.float64, delimiter=separator, ndmin=2)
+            lines = chain([first.replace(",", ".") if separator == ";" else first], lines)
+        table = np.loadtxt(lines, np.float64, delimiter=separator, ndmin=2, quotechar='"')
     if named and not table.size:
         table = np.empty((0, len(words)))
     return _named(table, path, columns)
@@ -159,7 +192,10 @@ def _read_las(path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray
             if name.lower() not in ("x", "y", "z")
         ]
         scaled = {axis: np.asarray(getattr(cloud, axis)) for axis in ("x", "y", "z")}
-        return scaled | {name: np.asarray(cloud[name]) for name in names}
+        # in seconds by the format
+        return scaled | {
+            "gps_time_s" if name == "gps_time" else name: np.asarray(cloud[name]) for name in names
+        }
 
 
 _READERS: dict[str, Callable[[Path, tuple[str, ...] | None], dict[str, AnyArray]]] = {
@@ -168,6 +204,8 @@ _READERS: dict[str, Callable[[Path, tuple[str, ...] | None], dict[str, AnyArray]
     ".npz": _read_npz,
     ".csv": _read_csv,
     ".txt": _read_csv,
+    ".xyz": _read_csv,
+    ".pts": _read_csv,
     ".ply": _read_ply,
     ".pcd": _read_pcd,
     ".las": _read_las,

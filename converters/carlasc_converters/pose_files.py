@@ -1,37 +1,49 @@
-"""Files of poses and of times: TUM, KITTI, EuRoC, CSV with a header, NumPy; times in any unit, as
-whole nanoseconds.
+"""Files of poses and of times: TUM, KITTI, KITTI-360, EuRoC, CSV with a header, NumPy, the folders
+of hdl_graph_slam; times in any unit, as whole nanoseconds.
 """
 
 from __future__ import annotations
 
+import re
+from calendar import timegm
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
+from time import strptime
 from typing import Literal, TypeVar
 
 import numpy as np
 
 from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.geometry import check_rigid
+from carlasc.core.tables import lines_of
 from carlasc.errors import FormatError
 from carlasc.storage.arrays import NUMBERS, ArrayFormat, read_npy
 from carlasc_converters.files import opening, read_text
-from carlasc_converters.transforms import poses_of
+from carlasc_converters.transforms import BAD_SHARE, are_poses, poses_of
 
 PoseOf = Literal["sensor", "vehicle"]
 _Row = TypeVar("_Row")
 _Value = TypeVar("_Value")
 
-_TUM, _KITTI = 8, 12  # numbers in a line
-_PLACES = (
-    ("x", "y", "z"),
-    ("tx", "ty", "tz"),
-    ("px", "py", "pz"),
-    ("p_rs_r_x", "p_rs_r_y", "p_rs_r_z"),
+_TUM, _KITTI, _KITTI360 = 8, 12, (13, 17)  # numbers in a line
+_NAME = re.compile(
+    r"(?:.*?[^\d.])??(?:(?:(?P<date>(?:19|20)\d\d(?:[-_]?\d\d){2}[-_T ]?\d\d(?:[-_:]?\d\d){2})"
+    r"|(?P<seconds>[1-9]\d{8,9})(?=[-_]))(?:(?:(?P<point>\.)|[-_])(?P<rest>\d{1,9}))?"
+    r"|(?P<number>[1-9]\d{9,}(?:\.\d+)?|\d+\.\d{6,}))\D*"
 )
-_TURNS = (("qw", "qx", "qy", "qz"), ("q_rs_w", "q_rs_x", "q_rs_y", "q_rs_z"))
-_TIMES = ("timestamp", "time", "t", "stamp", "seconds", "sec", "nsec", "timestamp_ns", "time_ns")
+_PLACES = lines_of("""
+    x y z
+    tx ty tz
+    px py pz
+    p_rs_r_x p_rs_r_y p_rs_r_z
+""")
+_TURNS = lines_of("""
+    qw qx qy qz
+    q_rs_w q_rs_x q_rs_y q_rs_z
+""")
+_TIMES = "timestamp time t stamp seconds sec nsec timestamp_ns time_ns".split()
 # A number above one of these is in milliseconds, microseconds or nanoseconds; in seconds, it would
 # be a recording of years.
 _UNITS = ((Decimal(10) ** 17, 1), (Decimal(10) ** 14, 10**3), (Decimal(10) ** 11, 10**6))
@@ -45,11 +57,18 @@ class PoseRows:
         world_T_body: (K, 4, 4) float64.
         stamps: (K,) int64 nanoseconds, None if the file has no times.
         of: whose poses these are, if the format defines it.
+        numbers: (K,) increasing numbers of their scans, None if the file does not name them.
+        notes: what was left out.
+        other: (K, 4, 4) the poses if w is the first number of quaternions; None if their order is
+            certain.
     """
 
     world_T_body: FloatArray
     stamps: IntArray | None
     of: PoseOf
+    numbers: IntArray | None = None
+    notes: tuple[str, ...] = ()
+    other: FloatArray | None = None
 
 
 def read_poses(path: Path) -> PoseRows:
@@ -80,15 +99,19 @@ def read_poses(path: Path) -> PoseRows:
         return _read_named(header, rows, path, of="vehicle")
     if rows and len(rows[0]) == _TUM:
         table, stamps = _numbers(rows, _TUM, path), _stamps([row[0] for row in rows], path)
-        return PoseRows(
-            poses_of(table[:, [7, 4, 5, 6]], table[:, 1:4], str(path)), stamps, "sensor"
-        )
-    if rows and len(rows[0]) == _KITTI:
-        table = _numbers(rows, _KITTI, path)
-        return PoseRows(_whole(table.reshape(-1, 3, 4), path), None, "sensor")
+        return _rows_of(table[:, [1, 2, 3, 7, 4, 5, 6]], stamps, path, "sensor", ordered=False)
+    if rows and len(rows[0]) in (_KITTI, *_KITTI360):
+        width = len(rows[0])
+        table, numbers = _numbers(rows, width, path), None
+        if width != _KITTI:
+            numbers, table = table[:, 0].astype(np.int64), table[:, 1:13]
+            if (np.diff(numbers) <= 0).any():
+                raise FormatError(path, expected="numbers of scans that increase", found="others")
+        return PoseRows(_whole(table.reshape(-1, 3, 4), path), None, "sensor", numbers)
     raise FormatError(
         path,
-        expected="poses: lines of 8 numbers (TUM: t x y z qx qy qz qw) or of 12 (KITTI), a header "
+        expected="poses: lines of 8 numbers (TUM: t x y z qx qy qz qw), of 12 (KITTI) or of 13 "
+        "(KITTI-360: number of the scan, and 12), a header "
         "with x, y, z, qw, qx, qy, qz, or .npy",
         found=f"lines of {len(rows[0])} values" if rows else "no lines",
     )
@@ -128,7 +151,7 @@ def nanoseconds(word: str) -> int:
 def _read_named(
     header: Sequence[str], rows: Sequence[list[str]], path: Path, of: PoseOf = "sensor"
 ) -> PoseRows:
-    def columns(choices: Sequence[tuple[str, ...]], what: str) -> list[int]:
+    def columns(choices: Sequence[list[str]], what: str) -> list[int]:
         for names in choices:
             if all(name in header for name in names):
                 return [header.index(name) for name in names]
@@ -140,11 +163,82 @@ def _read_named(
     times = next((header.index(name) for name in _TIMES if name in header), None)
     table = _numbers(rows, len(header), path)
     stamps = None if times is None else _stamps([row[times] for row in rows], path)
-    return PoseRows(poses_of(table[:, turns], table[:, places], str(path)), stamps, of)
+    return _rows_of(table[:, places + turns], stamps, path, of)
+
+
+def _rows_of(
+    table: FloatArray, stamps: IntArray | None, path: Path, of: PoseOf, *, ordered: bool = True
+) -> PoseRows:
+    """Return the poses of a table (K, 7) of x, y, z and a quaternion w, x, y, z.
+
+    With times, a few rows that are no poses are left out, and of rows with one time the last is
+    taken.
+    """
+    notes, where = list[str](), str(path)
+    if stamps is not None:
+        bad = ~are_poses(table)
+        if bad.sum() > BAD_SHARE * len(table):
+            bad[:] = False  # the first one is named below
+        again = np.append(np.diff(stamps) == 0, False)
+        for left, what in ((bad, "are no poses"), (again, "have the time of the next one")):
+            if left.any():
+                notes.append(f"{where}: {left.sum()} of {len(left)} rows {what}, and are left out")
+        table, stamps = table[~(bad | again)], stamps[~(bad | again)]
+    poses = poses_of(table[:, 3:], table[:, :3], where)
+    other = None if ordered else poses_of(table[:, [4, 5, 6, 3]], table[:, :3], where)
+    return PoseRows(poses, stamps, of, notes=tuple(notes), other=other)
+
+
+def read_folders(folders: Sequence[Path]) -> PoseRows:
+    """Read the poses and times of the folders that hdl_graph_slam writes: one for each scan, with a
+    text file `data`.
+
+    Raises:
+        MissingDataError: a file does not exist.
+        FormatError: it has no time or pose.
+    """
+    stamps, poses = list[int](), list[FloatArray]()
+    for folder in folders:
+        path = folder / "data"
+        with opening(path, "the time and the pose of a scan: stamp and estimate"):
+            words = path.read_text("utf-8").split()
+            at = words.index("stamp")
+            stamps.append(int(words[at + 1]) * 10**9 + int(words[at + 2]))
+            at = words.index("estimate") + 1
+            poses.append(np.array(words[at : at + 16], np.float64).reshape(4, 4))
+    return PoseRows(_whole(np.array(poses), folders[0].parent), np.array(stamps), "sensor")
+
+
+def stamps_of_names(names: Sequence[str]) -> IntArray | None:
+    """Return the (F,) nanoseconds of names that are the times of scans; None if they are not.
+
+    They end with a date, with seconds and nanoseconds, or with a number of at least ten digits, or
+    with decimals, that does not begin with 0.
+    """
+    matches = [match for name in names if (match := _NAME.fullmatch(name))]
+    if len(matches) < len(names):
+        return None
+    # parts of a second that are not decimals have the same width, or are nanoseconds
+    widths = {len(match["rest"] or "") for match in matches}
+    stamps = []
+    for match in matches:
+        if match["number"]:
+            stamps.append(nanoseconds(match["number"]))
+            continue
+        try:
+            date = strptime(re.sub(r"\D", "", match["date"] or "19700101000000"), "%Y%m%d%H%M%S")
+        except ValueError:
+            return None
+        rest = match["rest"] or ""
+        width = len(rest) if match["point"] or len(widths) == 1 else 9
+        seconds = int(match["seconds"] or timegm(date))
+        stamps.append(seconds * 10**9 + int(rest or 0) * 10 ** (9 - width))
+    return np.array(stamps, np.int64) if (np.diff(stamps) > 0).all() else None
 
 
 def _split(line: str) -> list[str]:
-    return [word.strip() for word in line.split(",")] if "," in line else line.split()
+    mark = next((mark for mark in ";," if mark in line), None)
+    return [word.strip(' "') for word in line.split(mark)]
 
 
 def _numbers(rows: Sequence[list[str]], columns: int, path: Path) -> FloatArray:
@@ -161,8 +255,8 @@ def _floats(row: list[str], columns: int) -> list[float]:
 
 def _stamps(words: Sequence[str], path: Path, *, increasing: bool = True) -> IntArray:
     stamps = np.array(_each(words, nanoseconds, "a time", path), np.int64)
-    if increasing and (np.diff(stamps) <= 0).any():
-        line = int(np.argmax(np.diff(stamps) <= 0)) + 2
+    if increasing and (np.diff(stamps) < 0).any():
+        line = int(np.argmax(np.diff(stamps) < 0)) + 2
         raise FormatError(
             path,
             expected="times that increase",

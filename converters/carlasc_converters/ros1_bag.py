@@ -132,7 +132,8 @@ def _read_chunk(path: str, at: int, version: Version) -> bytes:
     with Path(path).open("rb") as file:
         fields, begin, end = _record_at(file, at)
         file.seek(begin)
-        return decompressed(file.read(end - begin), fields[b"compression"].decode(), path)
+        codec, size = fields[b"compression"].decode(), _number(fields, b"size")
+        return decompressed(file.read(end - begin), codec, path, size)
 
 
 def _record_at(file: BinaryIO, at: int) -> tuple[_Fields, int, int]:

@@ -13,12 +13,19 @@ import numpy as np
 
 from carlasc.converting import Cloud, FrameHandle
 from carlasc.core.arrays import Uint32Array
-from carlasc.core.geometry import Transform
+from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.errors import FormatError
 from carlasc.relabelling.predictions import load
 from carlasc.storage.arrays import NUMBERS, ArrayFormat, read_npy
 from carlasc_converters.files import opening
-from carlasc_converters.point_fields import TimeUnit, named_fields, point_seconds, whole_numbers
+from carlasc_converters.point_fields import (
+    PointClock,
+    TimeUnit,
+    check_near,
+    named_fields,
+    returns,
+    whole_numbers,
+)
 from carlasc_converters.point_files import read_columns
 
 
@@ -48,8 +55,9 @@ class ScanFile(FrameHandle):
         labels: the file of the classes of its points, of the first LiDAR.
         fields: fields that each file must have, those of the first one.
         options: the options for the files.
-        unit: unit of the times of points; None if they have none.
+        clock: how the times of points are found; None if they have none.
         stamp: nanoseconds of the scan, where times of points are those of a clock.
+        world_T_scan: (4, 4) the pose of the scan, where its points are in the world frame.
     """
 
     number: int
@@ -57,8 +65,9 @@ class ScanFile(FrameHandle):
     labels: str | None
     fields: tuple[str, ...]
     options: ScanOptions
-    unit: TimeUnit | None
+    clock: PointClock | None
     stamp: int | None
+    world_T_scan: Transform | None = None
 
     @property
     def location(self) -> str:  # type: ignore[override]
@@ -68,12 +77,13 @@ class ScanFile(FrameHandle):
     def read(self) -> Sequence[Cloud]:
         """Read the points.
 
-        Points that are not finite are left out, because they are rays without a return.
+        Points whose position is not finite are left out, because they are rays without a return.
         """
         return [self._read(index, path) for index, path in enumerate(self.paths)]
 
     def _read(self, index: int, path: str) -> Cloud:
-        fields = named_fields(read_columns(Path(path), self.options.columns), path)
+        columns = read_columns(Path(path), self.options.columns)
+        fields = named_fields(columns, path, self.clock)
         if set(fields) != set(self.fields):
             raise FormatError(
                 path,
@@ -81,20 +91,22 @@ class ScanFile(FrameHandle):
                 found=", ".join(fields),
             )
         points, seconds = fields["points"], None
-        if self.unit:
-            seconds, start, _ = point_seconds(fields["time"], self.unit, path)
-            if start is not None and self.stamp is not None:
-                seconds = seconds + (start - self.stamp) / 1e9
+        if self.clock is not None:
+            seconds = self.clock.seconds(columns, returns(columns), self.stamp, path)
         labels = fields.get("label") if self.options.has_classes else None
         if self.labels is not None and index == 0:
             labels = read_labels(Path(self.labels), len(points))
         instances = fields.get("instance") if self.options.has_classes else None
-        finite = np.isfinite(points).all(axis=1)
+        finite = np.isfinite(points[:, :3]).all(axis=1)
         if not finite.any():
             raise FormatError(
                 path, expected="points", found="none that is finite", advice="remove the scan"
             )
         points = points[finite]
+        points[:, 3] = np.nan_to_num(points[:, 3])
+        if self.world_T_scan is not None:
+            points[:, :3] = transform_points(invert(self.world_T_scan), points[:, :3])
+        check_near(points, path)
         if not np.array_equal(self.options.axes, np.eye(4)):
             points = points.copy()
             points[:, :3] = points[:, :3] @ self.options.axes[:3, :3].T.astype(np.float32)

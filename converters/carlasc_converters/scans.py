@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -13,20 +15,42 @@ import numpy as np
 
 from carlasc.converting import Converter, FrameHandle, Recording, Sensor, Trajectory
 from carlasc.core.arrays import AnyArray, FloatArray, IntArray
-from carlasc.core.geometry import Transform, invert
+from carlasc.core.geometry import Transform, invert, slerp
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.motion.ground import find_ground
 from carlasc_converters.calibration_file import axes_named, in_axes, read_calibration
-from carlasc_converters.files import sequence_name
+from carlasc_converters.files import raw_advice, sequence_name
 from carlasc_converters.given_classes import classes_given
-from carlasc_converters.point_fields import TimeUnit, named_fields, point_seconds
+from carlasc_converters.pcd import PcdHeader, read_header
+from carlasc_converters.point_fields import (
+    PointClock,
+    TimeUnit,
+    check_near,
+    find_clock,
+    named_fields,
+    point_seconds,
+    returns,
+    unread,
+)
 from carlasc_converters.point_files import FORMATS, read_columns
-from carlasc_converters.pose_files import PoseRows, nanoseconds, read_poses, read_stamps
+from carlasc_converters.pose_files import (
+    PoseRows,
+    read_folders,
+    read_poses,
+    read_stamps,
+    stamps_of_names,
+)
 from carlasc_converters.scan_files import ScanFile, ScanOptions
+from carlasc_converters.transforms import are_poses, poses_of
 
 _TABLES = (".csv", ".txt")  # suffixes of scans that files of poses and times may have, too
-_STAMPED = re.compile(r"\d{9,}(\.\d+)?|\d+\.\d{6,}")  # a file name that is the time of its scan
 _LABELS = (".label", ".npy", ".txt")
+_GRAPH_SLAM = "cloud.pcd"  # hdl_graph_slam: a folder for each scan, with the file `data`
+_GROUND_M = 0.3  # ground must be at least this far below the sensor
+_NEARER = 1.05  # points that are farther from the viewpoint than from the origin by this are not
+_TILTED, _LEVEL = 0.5, 0.9  # cosine of the tilt of poses that are wrong, and that are right
+_SLACK = 10  # numbers of scans before the first pose or after the last one that get a pose
 _SLACK_NS = 10**9  # scans up to this time before the first pose or after the last one get a pose
 
 
@@ -108,14 +132,18 @@ class Scans(Converter):
             self._check_counts(files)
         else:
             (name,) = lidars or ("lidar",)
-            files = {name: self._files(self._folder())}
+            nodes = sorted(path.with_name(_GRAPH_SLAM) for path in self.source.glob("*/data"))
+            files = {name: nodes or self._files(self._folder())}
         return [ScanFolder(self.source, files, lidars, options)]
 
     def _folder(self) -> Path:
         """Return the folder of the scans: the source, or the only folder in it with scans."""
         if not self.source.is_dir():
             raise MissingDataError(
-                self.source, expected="a folder of scans", found="no such folder"
+                self.source,
+                expected="a folder of scans",
+                found="a file" if self.source.exists() else "no such folder",
+                advice=raw_advice([self.source.name]),
             )
         inner = [
             path for path in sorted(self.source.iterdir()) if path.is_dir() and self._scans_in(path)
@@ -153,11 +181,13 @@ class Scans(Converter):
         kinds = Counter(path.suffix.lower() for path in files)
         scans = {kind: count for kind, count in kinds.items() if kind not in _TABLES} or dict(kinds)
         if not scans:
-            expected, advice = (
-                f"scans: files with the suffix {', '.join(FORMATS)}",
-                "give the folder of the scans",
+            names = [path.name for path in folder.iterdir()] if folder.is_dir() else []
+            raise MissingDataError(
+                folder,
+                expected=f"scans: files with the suffix {', '.join(FORMATS)}",
+                found="none",
+                advice=raw_advice(names) or "give the folder of the scans",
             )
-            raise MissingDataError(folder, expected=expected, found="none", advice=advice)
         if len(scans) > 1:
             counts = ", ".join(f"{count} {kind}" for kind, count in sorted(scans.items()))
             raise FormatError(
@@ -197,26 +227,102 @@ class ScanFolder(Recording):
         return next(iter(self._files.values()))
 
     @cached_property
-    def _first(self) -> dict[str, AnyArray]:
-        """The fields of the first scan."""
-        return named_fields(
-            read_columns(self._paths[0], self._options.columns), str(self._paths[0])
-        )
+    def _samples(self) -> list[tuple[Path, dict[str, AnyArray]]]:
+        """The first and the last scan that can be read, and their columns.
+
+        Raises:
+            FormatError: no scan can be read.
+        """
+        samples, problem = list[tuple[Path, dict[str, AnyArray]]](), None
+        for paths in (self._paths, reversed(self._paths)):
+            for path in paths:
+                try:
+                    samples.append((path, read_columns(path, self._options.columns)))
+                    break
+                except FormatError as error:
+                    problem = problem or error
+        if problem is not None and not samples:
+            raise problem
+        return samples
 
     @cached_property
-    def _clock(self) -> tuple[TimeUnit | None, int | None]:
-        """The unit of the times of points, and the start of the first scan, if these are times of a
-        clock.
+    def _first(self) -> dict[str, AnyArray]:
+        """The fields of the first scan."""
+        path, columns = self._samples[0]
+        fields = named_fields(columns, str(path), self._clock)
+        if not self._in_world:
+            check_near(fields["points"], str(path))
+        return fields
+
+    @cached_property
+    def _clock(self) -> PointClock | None:
+        """How the times of points are found; None if they have none."""
+        path, options = str(self._samples[0][0]), self._options
+        scans = [(columns, None) for _, columns in self._samples]
+        return find_clock(scans, options.time_unit, path, needed=not options.deskewed)
+
+    @cached_property
+    def _viewpoints(self) -> FloatArray | None:
+        """(F, 4, 4) poses of the scans in the headers of PCD files; None if they have none, or all
+        the same.
         """
-        times = self._first.get("time")
-        if times is None:
-            return None, None
-        _, start, unit = point_seconds(times, self._options.time_unit, str(self._paths[0]))
-        return unit, start
+        if self._paths[0].suffix.lower() != ".pcd" or len(self._files) > 1:
+            return None
+        found = [PcdHeader.viewpoint]
+        for path in self._paths:
+            try:
+                found.append(read_header(path).viewpoint)
+            except FormatError:
+                found.append(found[-1])  # reading its scan reports the error
+        rows = np.array(found[1:], np.float64)
+        if np.ptp(rows, axis=0).max() == 0 or not are_poses(rows).all():
+            return None
+        return poses_of(rows[:, 3:], rows[:, :3], self.location)
+
+    @cached_property
+    def _in_world(self) -> bool:
+        """Whether the points of scans are in the frame of the viewpoints: nearer to these than to
+        the origin.
+        """
+        if self._viewpoints is None:
+            return False
+        row = int(np.argmax(np.abs(self._viewpoints[:, :3, 3]).max(axis=1)))
+        columns = read_columns(self._paths[row], None)
+        points = named_fields(columns, str(self._paths[row]))["points"][returns(columns), :3]
+        place = self._viewpoints[row, :3, 3]
+        near, far = (np.linalg.norm(points - origin, axis=1) for origin in (place, np.zeros(3)))
+        return bool(np.median(near) <= _NEARER * np.median(far))
 
     @cached_property
     def _poses(self) -> PoseRows | None:
-        return None if self._options.pose_file is None else read_poses(self._options.pose_file)
+        file = self._options.pose_file
+        if file is None and self._paths[0].name == _GRAPH_SLAM:
+            return read_folders([path.parent for path in self._paths])
+        if file is None and self._viewpoints is not None:
+            return PoseRows(self._viewpoints, None, "sensor")
+        if file is None:
+            return None
+        rows = read_poses(file)
+        up = self._up if rows.other is not None else None
+        if rows.other is None or up is None:
+            return rows
+        level, other = (up * poses[:, 2, 2].mean() for poses in (rows.world_T_body, rows.other))
+        if level > _TILTED or other < _LEVEL:
+            return rows
+        said = f"{file}: quaternions are w, x, y, z, because otherwise the ground is not below"
+        return replace(rows, world_T_body=rows.other, notes=(*rows.notes, said))
+
+    @cached_property
+    def _up(self) -> int | None:
+        """1 if the ground is below the sensor in its own axes, -1 if it is above; None if it is not
+        found.
+        """
+        points = self._first["points"][:, :3]
+        for sign in (1, -1):
+            ground = find_ground([points * np.array([1, 1, sign], np.float32)])
+            if ground is not None and ground.below_m > _GROUND_M:
+                return sign
+        return None
 
     @cached_property
     def _stamps(self) -> tuple[IntArray | None, str]:
@@ -231,34 +337,37 @@ class ScanFolder(Recording):
                     found=f"{len(stamps)} times",
                 )
             return stamps, str(self._options.time_file)
-        if self._clock[1] is not None:
-            return np.array(
-                [self._start_of(path) for path in self._paths], np.int64
-            ), "the times of points"
-        if all(_STAMPED.fullmatch(path.stem) for path in self._paths):
-            stamps = np.array([nanoseconds(path.stem) for path in self._paths], np.int64)
-            if (np.diff(stamps) > 0).all():
-                return stamps, "the names of the files"
-        if (
-            self._poses is not None
-            and self._poses.stamps is not None
-            and len(self._poses.stamps) == count
-        ):
+        rows, given = None if self._poses is None else self._poses.stamps, None
+        if self._clock is not None and self._clock.absolute:
+            given = self._starts(self._clock), "the times of points"
+        elif (names := stamps_of_names([path.stem for path in self._paths])) is not None:
+            given = names, "the names of the files"
+        if given is not None and (rows is None or _together(given[0], rows)):
+            return given
+        if rows is not None and len(rows) == count:
             return (
-                self._poses.stamps,
-                f"{self._options.pose_file}, whose lines go by the order of the scans",
+                rows,
+                f"{self._options.pose_file or 'data'}, whose lines go by the order of the scans",
             )
-        return None, ""
+        return given or (None, "")
 
-    def _start_of(self, path: Path) -> int:
-        times = named_fields(read_columns(path, self._options.columns), str(path)).get("time")
-        unit = self._clock[0] or "auto"
-        start = None if times is None else point_seconds(times, unit, str(path))[1]
-        if start is None:
-            raise FormatError(
-                path, expected="times of points by a clock, as in the first scan", found="others"
-            )
-        return start
+    def _starts(self, clock: PointClock) -> IntArray:
+        """Return the (F,) nanoseconds of the first point of each scan; between those of the others
+        where a scan cannot be read.
+        """
+        found = dict[int, int]()
+        for row, path in enumerate(self._paths):
+            with suppress(FormatError):
+                columns = read_columns(path, self._options.columns)
+                if (times := clock.of(columns)) is not None:
+                    seen = returns(columns)
+                    start = point_seconds(times, clock.unit, str(path), seen, absolute=True)[1]
+                    found |= {} if start is None else {row: start}
+        first, rows, known = next(iter(found.values())), np.arange(len(self._paths)), list(found)
+        after = np.interp(rows, known, [start - first for start in found.values()])
+        period = after[known[-1]] / max(1, known[-1] - known[0])
+        after += period * (rows - rows.clip(known[0], known[-1]))
+        return first + np.round(after).astype(np.int64)
 
     @cached_property
     def frames(self) -> Sequence[FrameHandle]:  # type: ignore[override]
@@ -272,8 +381,11 @@ class ScanFolder(Recording):
                 None if labels is None else str(labels[number]),
                 tuple(self._first),
                 self._options,
-                self._clock[0],
-                None if stamps is None or self._clock[1] is None else int(stamps[number]),
+                self._clock,
+                None if stamps is None else int(stamps[number]),
+                self._viewpoints[number]
+                if self._in_world and self._viewpoints is not None
+                else None,
             )
             for number in range(len(self._paths))
         ]
@@ -303,7 +415,7 @@ class ScanFolder(Recording):
         """The LiDARs, with their poses from the calibration; without one, the frame of the LiDAR is
         that of the vehicle.
         """
-        deskewed = self._options.deskewed or "time" not in self._first
+        deskewed = self._options.deskewed or self._clock is None or self._in_world
         return [
             Sensor(
                 name,
@@ -345,7 +457,9 @@ class ScanFolder(Recording):
         world_T_vehicle = (
             world_T_body if of == "vehicle" else world_T_body @ invert(vehicle_T_sensor)
         )
-        stamps, where = self._stamps[0], str(self._options.pose_file)
+        stamps, where = self._stamps[0], str(self._options.pose_file or self.location)
+        if rows.numbers is not None:
+            return Trajectory(self._by_number(rows.numbers, world_T_vehicle), where=where)
         if rows.stamps is None or stamps is None:
             if len(world_T_vehicle) != len(self._paths):
                 raise FormatError(
@@ -365,17 +479,59 @@ class ScanFolder(Recording):
             )
         return Trajectory(world_T_vehicle, (rows.stamps - stamps[0]) / 1e9, where)
 
+    def _by_number(self, numbers: IntArray, poses: FloatArray) -> FloatArray:
+        """Return the poses of the scans, interpolated by the numbers in the names of their files.
+
+        Raises:
+            FormatError: names have no numbers, or there are no poses near these.
+        """
+        own = [int((re.findall(r"\d+", path.stem) or [-_SLACK])[-1]) for path in self._paths]
+        if min(own) < numbers[0] - _SLACK or max(own) > numbers[-1] + _SLACK:
+            raise FormatError(
+                str(self._options.pose_file),
+                expected=f"poses of the scans {min(own)} to {max(own)}, by their names",
+                found=f"poses of {numbers[0]} to {numbers[-1]}",
+                advice="leave out the scans without poses",
+            )
+        return slerp(poses, numbers.astype(np.float64), np.array(own, np.float64))
+
+    @property
+    def _others(self) -> list[str]:
+        """The names of the files beside the scans that are not read."""
+        options = self._options
+        folders = {Path(self.location), *(paths[0].parent for paths in self._files.values())}
+        given = {options.pose_file, options.time_file, options.calibration, *(self._labels or ())}
+        read = {path.resolve() for path in given if path is not None}
+        read |= {path.resolve() for paths in self._files.values() for path in paths}
+        return sorted(
+            path.name
+            for folder in folders
+            for path in folder.iterdir()
+            if path.is_file() and path.resolve() not in read
+        )
+
     def notes(self) -> list[str]:
-        """Return notes on what was found and assumed."""
-        options, notes = self._options, list[str]()
+        """Return notes on what was found and assumed, and on what is not read."""
+        options, notes = self._options, list(self._poses.notes if self._poses else ())
+        if left := unread(self._samples[0][1], self._clock, classes=True):
+            notes.append(f"the columns {', '.join(left)} of points were not read")
+        if self._others:
+            notes.append(f"the files {', '.join(self._others)} were not read")
+        if self._viewpoints is not None and options.pose_file is None:
+            notes.append("poses are the VIEWPOINT of the scans")
+        if self._in_world:
+            notes.append(
+                "points are in the world frame, as the VIEWPOINT of their files says: they were "
+                "moved to the frame of the sensor"
+            )
         if self._stamps[0] is not None and options.time_file is None:
             notes.append(f"the times of scans are from {self._stamps[1]}")
-        if self._clock[0] and options.time_unit == "auto":
+        if self._clock and options.time_unit == "auto":
             notes.append(
-                f"the times of points are in {self._clock[0]}, because scans then have a usual "
+                f"the times of points are in {self._clock.unit}, because scans then have a usual "
                 f"duration"
             )
-        if "time" in self._first and not options.deskewed:
+        if not self.sensors[0].deskewed:
             notes.append(
                 "points have times, so that they were corrected for the motion of the vehicle; "
                 "give `deskewed=True` to keep them"
@@ -386,6 +542,11 @@ class ScanFolder(Recording):
                 "it"
             )
         return notes
+
+
+def _together(stamps: IntArray, poses: IntArray) -> bool:
+    """Whether scans and poses were recorded at the same time."""
+    return bool(poses[0] - _SLACK_NS <= stamps[-1] and stamps[0] <= poses[-1] + _SLACK_NS)
 
 
 def _path(name: str | None) -> Path | None:

@@ -32,15 +32,26 @@ from carlasc.core.arrays import FloatArray, Uint8Array
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.geometry import translation
 from carlasc.core.grids import GridSpec
-from carlasc.core.tables import CARLA
+from carlasc.core.tables import CARLA, lines_of
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, StorageError, import_extra
 from carlasc_converters.files import opening
 
-_CLASSES = (  # name, class of CarlaSC; the data count from 0, here 0 is unlabelled
-    ("unlabelled", "Free"), ("building", "Building"), ("car", "Vehicle"),
-    ("natural ground", "Terrain"), ("ground", "Ground"), ("pole-like", "Pole"), ("road", "Road"),
-    ("street furniture", "Static"), ("tree", "Vegetation"), ("pavement", "Sidewalk"),
-)  # fmt: skip
+# name, class of CarlaSC; the data count from 0, here 0 is unlabelled
+_CLASSES = [
+    (" ".join(name), target)
+    for *name, target in lines_of("""
+    unlabelled Free
+    building Building
+    car Vehicle
+    natural ground Terrain
+    ground Ground
+    pole-like Pole
+    road Road
+    street furniture Static
+    tree Vegetation
+    pavement Sidewalk
+""")
+]
 _TARGETS = {index: CARLA.id_of(target) for index, (_, target) in enumerate(_CLASSES)}
 CLASSES = ClassTable(
     "synthcity",
@@ -52,20 +63,13 @@ CLASSES = ClassTable(
 # possible names of columns, in lower case, letters only, because the published names are not
 # certain
 _SYNONYMS = {
-    "x": {"x", "xcoord", "xcoordinate", "posx"},
-    "y": {"y", "ycoord", "ycoordinate", "posy"},
-    "z": {"z", "zcoord", "zcoordinate", "posz"},
-    "label": {
-        "label",
-        "labels",
-        "labelid",
-        "class",
-        "classes",
-        "classid",
-        "classification",
-        "category",
-        "semantic",
-    },
+    key: {*names}
+    for key, *names in lines_of("""
+    x x xcoord xcoordinate posx
+    y y ycoord ycoordinate posy
+    z z zcoord zcoordinate posz
+    label label labels labelid class classes classid classification category semantic
+""")
 }
 _COLUMNS = "x=NAME,y=NAME,z=NAME,label=NAME"
 _HEIGHT_M = (

@@ -9,12 +9,15 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from carlasc.core.arrays import AnyFloatArray, FloatArray, IntArray
+from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray, IntArray
 from carlasc.core.geometry import check_rigid, inverse_of, multiply, poses_from, slerp
 from carlasc.errors import FormatError
 
 _UNIT_TOLERANCE = 1e-3  # greatest deviation of a quaternion's norm from 1
+BAD_SHARE = 0.1
+"""Greatest share of the poses of a recording that are left out because they are no poses."""
 
 
 def poses_of(quaternions: AnyFloatArray, translations: AnyFloatArray, where: str) -> FloatArray:
@@ -28,8 +31,7 @@ def poses_of(quaternions: AnyFloatArray, translations: AnyFloatArray, where: str
     Raises:
         FormatError: a quaternion does not have length 1, or a number is not finite.
     """
-    with np.errstate(over="ignore", invalid="ignore"):
-        valid = np.abs(np.linalg.norm(quaternions, axis=1) - 1) <= _UNIT_TOLERANCE
+    valid = are_poses(np.concatenate([np.zeros_like(translations), quaternions], axis=1))
     if not valid.all():
         row = int(np.argmin(valid))
         found = f"{np.asarray(quaternions[row], np.float64).tolist()} in row {row}"
@@ -37,6 +39,17 @@ def poses_of(quaternions: AnyFloatArray, translations: AnyFloatArray, where: str
             where, expected="a rotation: a quaternion w, x, y, z of length 1", found=found
         )
     return check_rigid(poses_from(quaternions, translations), where, 4 * _UNIT_TOLERANCE)
+
+
+def are_poses(numbers: ArrayLike) -> BoolArray:
+    """Return (N,) whether rows x, y, z, and of a quaternion in any order, are finite, and the
+    quaternion has length 1.
+    """
+    rows = np.asarray(numbers, np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        valid = np.abs(np.linalg.norm(rows[..., 3:], axis=-1) - 1) <= _UNIT_TOLERANCE
+    valid &= np.isfinite(rows[..., :3]).all(axis=-1)
+    return np.asarray(valid)
 
 
 _STILL = 1e-9  # a transform that changes by less is static

@@ -74,7 +74,7 @@ def test_points_times_and_poses_come_back(tmp_path, kind, poses):
             sensor.vehicle_T_sensor, DRIVE.sensors[0].vehicle_T_sensor, atol=1e-12
         )
         assert sensor.calibrated and not sensor.deskewed
-        units, said = recording.notes()
+        units, said, *_ = recording.notes()
         assert units == "/lidar/points: the times of points are in s"
         assert "the poses are those of base_link" in said
         assert said.endswith(", which is assumed: the messages do not name it") == (
@@ -357,5 +357,5 @@ def test_transforms_that_move_something_else_are_noted(tmp_path):
 
     recording = recording_of(tmp_path, "mcap", messages)
     assert recording.poses() is None
-    (note,) = recording.notes()
+    note = recording.notes()[0]
     assert note.endswith(f"transforms do not say how lidar moves, only {WORLD} > {BASE}")

@@ -11,6 +11,7 @@ import numpy as np
 from carlasc.converting import remaps_to_carla
 from carlasc.core.arrays import Int32Array, LabelArray
 from carlasc.core.classes import ClassTable
+from carlasc.core.tables import lines_of
 from carlasc.errors import FormatError
 
 _NONE = -2
@@ -30,64 +31,71 @@ class Kind(NamedTuple):
     category: int
 
 
-_KINDS = {  # vehicles as in CarlaOcc, for CARLA's tags, if it has them
-    "bicycle": Kind(2, 11, 3),
-    "motorcycle": Kind(6, 15, 14),
-    "truck": Kind(10, 18, 25),
-    "bus": Kind(3, 13, 7),
-    "train": Kind(9, 16, 18),
-    "trailer": Kind(9, 20, 27),
-    "construction": Kind(5, 20, 11),
-    "other": Kind(0, 20, 11),
-    "cone": Kind(8, 99, 9),
-    "flat": Kind(12, 49, 0),
-    "parking": Kind(11, 44, 0),
+# kind, and its classes; vehicles as in CarlaOcc, for CARLA's tags, if it has them
+_KINDS = {
+    name: Kind(*map(int, numbers))
+    for name, *numbers in lines_of("""
+    bicycle 2 11 3
+    motorcycle 6 15 14
+    truck 10 18 25
+    bus 3 13 7
+    train 9 16 18
+    trailer 9 20 27
+    construction 5 20 11
+    other 0 20 11
+    cone 8 99 9
+    flat 12 49 0
+    parking 11 44 0
+""")
 }
-_TABLES = {  # name of a class table -> kind -> names of its classes
-    "carlaocc": {
-        "truck": "Truck",
-        "bus": "Bus",
-        "train": "Train",
-        "motorcycle": "Motorcycle",
-        "bicycle": "Bicycle",
-    },
-    "kitti": {"truck": "Truck", "train": "Tram", "other": "Misc"},
-    "kitti360": {
-        "bicycle": "bicycle",
-        "motorcycle": "motorcycle",
-        "truck": "truck",
-        "bus": "bus",
-        "train": "train",
-        "trailer": "caravan, trailer",
-        "other": "unknown vehicle",
-        "parking": "parking",
-    },
-    "nuscenes": {
-        "bicycle": "vehicle.bicycle",
-        "motorcycle": "vehicle.motorcycle",
-        "truck": "vehicle.truck",
-        "bus": "vehicle.bus.bendy, vehicle.bus.rigid",
-        "trailer": "vehicle.trailer",
-        "construction": "vehicle.construction",
-        "other": "vehicle.emergency.ambulance, vehicle.emergency.police",
-        "cone": "movable_object.trafficcone",
-        "flat": "flat.other",
-    },
-    "argoverse2": {
-        "bicycle": "BICYCLE",
-        "motorcycle": "MOTORCYCLE",
-        "truck": "BOX_TRUCK, LARGE_VEHICLE, TRUCK, TRUCK_CAB",
-        "bus": "ARTICULATED_BUS, BUS, SCHOOL_BUS",
-        "train": "RAILED_VEHICLE",
-        "trailer": "MESSAGE_BOARD_TRAILER, TRAFFIC_LIGHT_TRAILER, VEHICULAR_TRAILER",
-        "other": "WHEELED_DEVICE",
-        "cone": "CONSTRUCTION_CONE",
-    },
-}
+# name of a class table, kind, names of its classes
+_TABLES = [
+    line.strip().split(": ")
+    for line in """
+    carlaocc: truck: Truck
+    carlaocc: bus: Bus
+    carlaocc: train: Train
+    carlaocc: motorcycle: Motorcycle
+    carlaocc: bicycle: Bicycle
+    kitti: truck: Truck
+    kitti: train: Tram
+    kitti: other: Misc
+    kitti360: bicycle: bicycle
+    kitti360: motorcycle: motorcycle
+    kitti360: truck: truck
+    kitti360: bus: bus
+    kitti360: train: train
+    kitti360: trailer: caravan, trailer
+    kitti360: other: unknown vehicle
+    kitti360: parking: parking
+    nuscenes: bicycle: vehicle.bicycle
+    nuscenes: motorcycle: vehicle.motorcycle
+    nuscenes: truck: vehicle.truck
+    nuscenes: bus: vehicle.bus.bendy, vehicle.bus.rigid
+    nuscenes: trailer: vehicle.trailer
+    nuscenes: construction: vehicle.construction
+    nuscenes: other: vehicle.emergency.ambulance, vehicle.emergency.police
+    nuscenes: cone: movable_object.trafficcone
+    nuscenes: flat: flat.other
+    argoverse2: bicycle: BICYCLE
+    argoverse2: motorcycle: MOTORCYCLE
+    argoverse2: truck: BOX_TRUCK, LARGE_VEHICLE, TRUCK, TRUCK_CAB
+    argoverse2: bus: ARTICULATED_BUS, BUS, SCHOOL_BUS
+    argoverse2: train: RAILED_VEHICLE
+    argoverse2: trailer: MESSAGE_BOARD_TRAILER, TRAFFIC_LIGHT_TRAILER, VEHICULAR_TRAILER
+    argoverse2: other: WHEELED_DEVICE
+    argoverse2: cone: CONSTRUCTION_CONE
+""".strip().splitlines()
+]
 KINDS: Mapping[str, Mapping[str, Kind]] = MappingProxyType(
     {
-        table: {name: _KINDS[kind] for kind, names in kinds.items() for name in names.split(", ")}
-        for table, kinds in _TABLES.items()
+        table: {
+            name: _KINDS[kind]
+            for other, kind, names in _TABLES
+            if other == table
+            for name in names.split(", ")
+        }
+        for table, _, _ in _TABLES
     }
 )
 """Name of a class table -> name of a class -> its kind in other data sets.

@@ -21,10 +21,11 @@ from carlasc.converting import Exported, Files, SequenceExporter, SequenceFile
 from carlasc.core.arrays import AnyArray, Float32Array, LabelArray, Uint32Array
 from carlasc.core.boxes import Boxes, mirror_boxes
 from carlasc.core.geometry import Transform, invert, mirror_points, mirror_poses, transform_points
-from carlasc.core.tables import SEMANTICKITTI
+from carlasc.core.tables import SEMANTICKITTI, lines_of
 from carlasc.errors import FormatError, MissingDataError, import_extra
 from carlasc.motion import ground_points
 from carlasc.storage import layout
+from carlasc_converters.argoverse2_classes import ARGOVERSE2
 from carlasc_converters.exporters.classes import classes_of, lookup_of, mapping_of
 
 _EVALUATED = 5  # every fifth scan with flow is evaluated, as in the project's own script
@@ -37,16 +38,31 @@ _FIRST_NS = (
 )
 _PROTOCOL = 4  # of the pickle: fixed, so that the bytes do not depend on the version of Python
 
-# Argoverse 2's categories in alphabetical order, from 1; 0 is none.
-_BICYCLE, _BICYCLIST, _BUS, _LARGE_VEHICLE, _MOTORCYCLE, _MOTORCYCLIST = 3, 4, 7, 11, 14, 15
-_PEDESTRIAN, _RAILED_VEHICLE, _REGULAR_VEHICLE, _TRUCK = 17, 18, 19, 25
+# raw id, category of Argoverse 2; ids of moving classes are repeated
 _KITTI = {
-    10: _REGULAR_VEHICLE, 11: _BICYCLE, 13: _BUS, 15: _MOTORCYCLE, 16: _RAILED_VEHICLE,
-    18: _TRUCK, 20: _LARGE_VEHICLE, 30: _PEDESTRIAN, 31: _BICYCLIST, 32: _MOTORCYCLIST,
-    252: _REGULAR_VEHICLE, 253: _BICYCLIST, 254: _PEDESTRIAN, 255: _MOTORCYCLIST,
-    256: _RAILED_VEHICLE, 257: _BUS, 258: _TRUCK, 259: _LARGE_VEHICLE,
-}  # fmt: skip
-_CARLA = {4: _PEDESTRIAN, 10: _REGULAR_VEHICLE}
+    int(raw): ARGOVERSE2.id_of(name)
+    for raw, name in lines_of("""
+    10 REGULAR_VEHICLE
+    11 BICYCLE
+    13 BUS
+    15 MOTORCYCLE
+    16 RAILED_VEHICLE
+    18 TRUCK
+    20 LARGE_VEHICLE
+    30 PEDESTRIAN
+    31 BICYCLIST
+    32 MOTORCYCLIST
+    252 REGULAR_VEHICLE
+    253 BICYCLIST
+    254 PEDESTRIAN
+    255 MOTORCYCLIST
+    256 RAILED_VEHICLE
+    257 BUS
+    258 TRUCK
+    259 LARGE_VEHICLE
+""")
+}
+_CARLA = {4: ARGOVERSE2.id_of("PEDESTRIAN"), 10: ARGOVERSE2.id_of("REGULAR_VEHICLE")}
 CATEGORIES: Mapping[str, Mapping[int, int]] = {
     "carla": {label: _CARLA.get(label, 0) for label in range(25)},
     "carlasc11": {label: _CARLA.get(label, 0) for label in range(11)},
