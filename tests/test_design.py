@@ -142,7 +142,7 @@ def test_converters_and_recorders_are_found_by_entry_points_only():
 
 
 def test_the_protocols_of_stores_rest_on_no_store_and_on_no_transport():
-    allowed = {"files", "layout", "metadata", "protocol"}
+    allowed = {"files", "layout", "protocol"}
     for name in ("protocol",):
         path = PACKAGE / "storage" / f"{name}.py"
         names = {

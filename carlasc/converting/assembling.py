@@ -12,6 +12,7 @@ import numpy as np
 
 from carlasc.converting.protocol import Cloud, Converter, FrameHandle, Sensor, Trajectory
 from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, LabelArray, Uint32Array
+from carlasc.core.choices import Axes
 from carlasc.core.choices import FlowSource as FlowSource  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import Images as Images  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable, Remap
@@ -26,7 +27,6 @@ from carlasc.errors import (
 )
 from carlasc.motion.odometry import move_each, ticks_of
 from carlasc.storage import layout
-from carlasc.storage.metadata import Axes
 
 _APART_M = 0.25  # positions of a sensor within a sweep that are closer than this count as one
 _IDS = np.iinfo(np.uint16).max + 1

@@ -29,7 +29,7 @@ from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
-from carlasc.storage.metadata import Metadata
+from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import SequenceWriter, Sink
 from carlasc.storage.resuming import agree_lines, agree_metadata, check_grid
 

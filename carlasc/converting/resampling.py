@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.arrays import BoolArray, IntArray, LabelArray
+from carlasc.core.choices import Axes
 from carlasc.core.grids import GridSpec, mirror_grid, mirror_spec, most_frequent
-from carlasc.storage.metadata import Axes
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 

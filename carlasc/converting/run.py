@@ -28,7 +28,7 @@ from carlasc.motion.options import PoseOptions
 from carlasc.running.processes import one_pool
 from carlasc.running.spreading import Part, Run, StepCounter
 from carlasc.storage.files import AnyPath
-from carlasc.storage.metadata import Metadata
+from carlasc.storage.layout import Metadata
 from carlasc.storage.opening import as_sink
 from carlasc.storage.protocol import Sequence, Sink, Source
 from carlasc.storage.transport.remote_tree import check_shared

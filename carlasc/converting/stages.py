@@ -58,7 +58,7 @@ from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.camera_files import cameras_to_json
-from carlasc.storage.metadata import Metadata
+from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import SequenceWriter
 
 VOXEL_FILES = "voxels_kitti"

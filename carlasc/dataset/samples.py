@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Self, SupportsIndex, cast, overload
 import numpy as np
 
 from carlasc.core.arrays import FloatArray, IntArray
+from carlasc.core.choices import Axes
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Coordinates, GridSpec
 from carlasc.core.notebook import describe
@@ -44,7 +45,6 @@ from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_c
 from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.camera_files import image_fields
 from carlasc.storage.files import AnyPath
-from carlasc.storage.metadata import Axes
 from carlasc.storage.transport.caching import CachedTree
 
 _STACKS = frozenset({"occupancy", "density", "visibility"})

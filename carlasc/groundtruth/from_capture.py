@@ -18,7 +18,7 @@ from carlasc.groundtruth.voxel_actors import ActorPoints
 from carlasc.storage import layout
 from carlasc.storage.camera_files import cameras_to_json
 from carlasc.storage.files import AnyPath
-from carlasc.storage.metadata import Metadata
+from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import Source
 
 if TYPE_CHECKING:

@@ -27,7 +27,7 @@ from carlasc.groundtruth.voxel_actors import VoxelActors
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.camera_files import cameras_of, scan_T_camera
-from carlasc.storage.metadata import Metadata
+from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import Sequence, SequenceWriter
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from carlasc.errors import CarlascError, MissingDataError, without_credentials
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath
 from carlasc.storage.folder import FolderSequence
-from carlasc.storage.metadata import Metadata
+from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import Sequence, Source
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.derived_copies import CopyResult, DerivedCopy, DerivedSequence
 from carlasc.storage.files import AnyPath
-from carlasc.storage.metadata import PREDICTED
+from carlasc.storage.layout import PREDICTED
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 
 PREDICTED_FIELDS = ("labels", "probabilities")

@@ -38,7 +38,7 @@ from carlasc.storage.derived_copies import (
     sequences_with_scans,
 )
 from carlasc.storage.files import AnyPath
-from carlasc.storage.metadata import Metadata
+from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 
 _RUN = 60  # number of scans in a run, for the mounting of the sensor

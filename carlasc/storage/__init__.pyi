@@ -5,8 +5,8 @@ from .copying import unpack as unpack
 from .downloading import download as download
 from .folder import FolderSink as FolderSink
 from .folder import FolderSource as FolderSource
-from .metadata import Axes as Axes
-from .metadata import Metadata as Metadata
+from .layout import Axes as Axes
+from .layout import Metadata as Metadata
 from .opening import as_source as as_source
 from .opening import open as open
 from .packing import pack as pack

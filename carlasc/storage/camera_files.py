@@ -11,11 +11,11 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray, LabelArray, Uint8Array
 from carlasc.core.cameras import CameraModel
+from carlasc.core.choices import Axes
 from carlasc.core.geometry import Transform, invert, slerp
 from carlasc.errors import FormatError, MissingDataError, import_extra
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json, to_json
-from carlasc.storage.metadata import Axes
 from carlasc.storage.protocol import Sequence
 
 _FORMAT = 1

@@ -35,7 +35,7 @@ from carlasc.storage.files import (
     write_atomic,
 )
 from carlasc.storage.folder import FolderSequence, FolderSink, FolderSource
-from carlasc.storage.metadata import Metadata
+from carlasc.storage.layout import Metadata
 from carlasc.storage.packed.output import remove
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 from carlasc.storage.transport.trees import is_url

@@ -37,7 +37,7 @@ from carlasc.errors import (
 )
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json
-from carlasc.storage.metadata import Metadata
+from carlasc.storage.layout import Metadata
 
 
 class FileTree(Protocol):

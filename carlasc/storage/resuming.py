@@ -20,7 +20,7 @@ from carlasc.core.arrays import AnyArray, FloatArray, IntArray
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json, to_json
-from carlasc.storage.metadata import Metadata
+from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import Sequence, SequenceWriter
 
 Kept = TypeVar("Kept")

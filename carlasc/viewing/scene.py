@@ -16,6 +16,7 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray, FloatArray, IntArray, LabelArray, Uint32Array
 from carlasc.core.boxes import Boxes, mirror_boxes
+from carlasc.core.choices import Axes
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.geometry import Transform, check_rigid, mirror_poses
@@ -28,7 +29,6 @@ from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.field_files import check_velocity
 from carlasc.storage.files import AnyPath
 from carlasc.storage.folder import FolderSequence
-from carlasc.storage.metadata import Axes
 from carlasc.viewing.colors import ACTORS, ERRORS, PALETTES, ClassColors, PaletteName, actor_ids
 from carlasc.viewing.photos import Photo, photos_of
 

@@ -18,7 +18,7 @@ from carlasc.inspection.reports import report_beside
 from carlasc.inspection.statistics import Statistics, stats
 from carlasc.inspection.texts import read_table, say
 from carlasc.running.spreading import Run
-from carlasc.storage.metadata import Metadata
+from carlasc.storage.layout import Metadata
 from carlasc.storage.packed.stores import PackedSource
 from carlasc.storage.protocol import Sequence as StoredSequence
 from carlasc.storage.protocol import Source

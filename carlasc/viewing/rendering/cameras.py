@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from carlasc.core.arrays import Float32Array, FloatArray
-from carlasc.core.choices import ViewName
+from carlasc.core.choices import Axes, ViewName
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, rotate_vectors, transform_points
 from carlasc.errors import ArgumentError, check_choice
-from carlasc.storage.metadata import Axes
 
 Floats = FloatArray
 

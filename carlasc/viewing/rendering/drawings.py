@@ -11,12 +11,12 @@ from itertools import pairwise
 import numpy as np
 
 from carlasc.core.arrays import AnyArray, AnyFloatArray, BoolArray, FloatArray, IntArray, Uint8Array
+from carlasc.core.choices import Axes
 from carlasc.core.choices import GridColor as GridColor  # noqa: PLC0414 (part of this module)
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.core.scans import Scan
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_choice
 from carlasc.metrics.grids import VoxelOutcome, compare_grids
-from carlasc.storage.metadata import Axes
 from carlasc.viewing import colors as palette
 from carlasc.viewing.actor_lines import MOVING_M_S, motion_arrows
 from carlasc.viewing.colors import AFTER_CLASSES, ERRORS, ClassColors, Entry, as_color

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from carlasc.core.arrays import Uint8Array
+from carlasc.core.choices import Axes
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import Grid
 from carlasc.core.scans import Scan
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, check_choice
-from carlasc.storage.metadata import Axes
 from carlasc.viewing.colors import ClassColors, Entry, PaletteName, merge_legends
 from carlasc.viewing.rendering.cameras import (
     VIEWS,

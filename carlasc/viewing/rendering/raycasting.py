@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from carlasc.core.arrays import AnyFloatArray, Float32Array, Uint8Array
+from carlasc.core.choices import Axes
 from carlasc.core.compiling import cached
 from carlasc.errors import import_extra
-from carlasc.storage.metadata import Axes
 from carlasc.viewing.rendering.cameras import Camera
 from carlasc.viewing.rendering.meshes import QuadMesh
 from carlasc.viewing.rendering.rasterizing import hits, visible_triangles

@@ -16,7 +16,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.storage import layout
 from carlasc.storage.files import write_json
 from carlasc.storage.folder import FolderSink
-from carlasc.storage.metadata import Metadata
+from carlasc.storage.layout import Metadata
 
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 SENSOR_HEIGHT_M = 1.8
