@@ -234,7 +234,7 @@ def _time_columns(columns: Columns) -> list[PointClock]:
     parts = {name: match for name in lower if (match := _TIME.fullmatch(name))}
     units: dict[str | None, Any] = {"curvature": "ms"}
     others = [
-        PointClock((name,), units.get(match["base"], match["unit"] or "auto"))
+        PointClock((name,), units.get(match["base"], match["unit"]) or "auto")
         for name, match in parts.items()
         if match["base"] and name not in TIMES
     ]
