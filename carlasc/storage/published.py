@@ -136,13 +136,12 @@ class PublishedSequence(Sequence):
 
     def read_many(self, field: str, frames: Iterable[int]) -> list[AnyArray]:
         """Read several files; all at once from a remote tree."""
-        entry = self._entry(field)
-        paths = [self._prefix + entry.file(frame) for frame in frames]
+        entry, paths, arrays = self._entry(field), list[str](), list[AnyArray]()
+        for frame in frames:  # in Python 3.11, a comprehension is a level of calls
+            paths.append(self._prefix + entry.file(frame))
         with_shape = entry.per in ("voxel", "vote", "moving voxel")
         shape = self.grids[entry.folder].size if with_shape else None
-        arrays = []
         for path, data in zip(paths, self.tree.read_many(paths, entry.size_of(shape)), strict=True):
-            # in Python 3.11, a comprehension is a level of calls
             arrays.append(entry.decode(data, self.tree.where(path), shape))
         return arrays
 

@@ -16,8 +16,16 @@ from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, FormatError, MissingDataError
 from carlasc_converters.bag_messages import CAMERA_INFO, PATH, TRANSFORMS, read_placed
-from carlasc_converters.bag_sensors import BagCamera, BagFrame, CloudPlace, LidarTopic, find_cameras
-from carlasc_converters.bag_topics import BagFiles, Topic, find_bags
+from carlasc_converters.bag_topics import (
+    BagCamera,
+    BagFiles,
+    BagFrame,
+    CloudPlace,
+    LidarTopic,
+    Topic,
+    find_bags,
+    find_cameras,
+)
 from carlasc_converters.files import sequence_name
 from carlasc_converters.point_fields import TimeUnit
 from carlasc_converters.transforms import BAD_SHARE, FrameTrack, FrameTree, PlacedFrame, are_poses
