@@ -354,11 +354,11 @@ class Sequence(ABC):
         wanted = {*layout.point_fields(), "boxes"} if fields is None else set(fields)
         boxes = self.boxes(frame) if "boxes" in wanted else None
         wanted = wanted & self.fields() - {"boxes", "remission"}
-        points = self.read("points", frame)
+        (points,) = self.read_many("points", [frame])
         read = {}
         for name in layout.point_fields():  # in Python 3.11, a comprehension is a level of calls
             if name in wanted:
-                read[name] = self.read(name, frame)
+                (read[name],) = self.read_many(name, [frame])
         own = {name: read.pop(name) for name in ("labels", "flow", "instances") if name in read}
         with within(f"{self.location}: frame {frame}"):
             return Scan(points[:, :3], remission=points[:, 3], **own, others=read, boxes=boxes)
