@@ -118,7 +118,7 @@ _TIME = re.compile(
 )
 _NANOSECONDS: dict[TimeUnit, int] = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 _SCAN_S = (0.004, 0.6)  # duration of a scan: 2 to 200 Hz; fact: scan-duration
-_LONGEST_S = 3.0  # no scan takes longer, whatever its unit is
+_LONGEST_S = 3.0  # no scan takes longer, whatever its unit is; fact: longest-scan
 _CLOCK_S = 1.0  # a scan begins within this time of its own time: other times are those of a clock
 _SAMPLE = 4000  # points of a scan that say how far away they are
 _FARTHEST_M = 2000.0  # no LiDAR on a vehicle sees so far

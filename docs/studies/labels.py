@@ -151,6 +151,7 @@ def judge(
     for frame, seen in references.items():
         with patch.object(_FrameSteps, "keep_returns") if case == MAY_BE_FREE else nullcontext():
             merged = merge_frame(plan, feed, actors, frame, feed.reaching(frame, plan.spec))
+        assert merged.votes is not None
         shares = (
             merged.evidence.classes
             if merged.evidence

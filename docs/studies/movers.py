@@ -36,9 +36,9 @@ from carlasc.core.frames import FrameRange
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth import Voting
 from carlasc.groundtruth.from_scans.feed import ScanFeed
-from carlasc.groundtruth.from_scans.frame import MergedFrame, merge_frame
+from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
-from carlasc.groundtruth.inputs import GridPlan
+from carlasc.groundtruth.inputs import FrameData, GridPlan
 from carlasc.inspection import holdout
 from carlasc.motion.tracks import MovingActors
 from carlasc.storage.files import write_atomic
@@ -209,7 +209,7 @@ def as_seen(grid: Grid, seen: Reference) -> Grid:
 
 def make(
     drive: Recorded, row: Row, grid: str, frames: Iterable[int], store: ActorStore
-) -> Iterator[tuple[int, MergedFrame, float]]:
+) -> Iterator[tuple[int, FrameData, float]]:
     """Yield the frames of a drive that are made in one way, each with the time that it took in
     seconds.
     """

@@ -18,9 +18,9 @@ from carlasc import FromScans, GridSpec, Run, Voting
 from carlasc.core.frames import FrameRange
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth.from_scans.feed import ScanFeed
-from carlasc.groundtruth.from_scans.frame import MergedFrame, merge_frame
+from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
-from carlasc.groundtruth.inputs import GridPlan
+from carlasc.groundtruth.inputs import FrameData, GridPlan
 from carlasc.motion import MotionOptions
 from carlasc.motion.tracks import MovingActors
 from carlasc.storage import FolderSink, FolderSource, layout
@@ -81,8 +81,9 @@ def test_a_frame_from_merged_scans(
     )
     frame = int(feed.frames[len(feed.frames) // 2])
 
-    def make() -> tuple[MergedFrame, Any]:
+    def make() -> tuple[FrameData, Any]:
         merged = merge_frame(plan, feed, MovingActors(), frame, feed.window_of(frame))
+        assert merged.votes is not None
         return merged, merged.votes.to_sparse()
 
     make()  # compiled, and the scans are read
@@ -114,7 +115,7 @@ def test_a_frame_with_a_part_of_the_rays(
     plan = GridPlan(spec, "evaluation", feed.options, Voting(), FrameRange())
     frame = int(feed.frames[len(feed.frames) // 2])
 
-    def make() -> MergedFrame:
+    def make() -> FrameData:
         return merge_frame(plan, feed, MovingActors(), frame, feed.window_of(frame))
 
     make()  # compiled, and the scans are read

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from carlasc import CardDetails, FromScans, LayoutOptions, StyleOptions, Voting
 from carlasc.cli import app, convert
-from carlasc.cli.flags import DeclaredOptions, OneWorkerFlags, flatten
+from carlasc.cli.flags import DeclaredOptions, OneWorkerFlags, declared_by, flatten
 from carlasc.cli.grid_flags import GroundTruthFlags, MotionGiven
 from carlasc.cli.library import TABLE, Given, Library, declarations
 from carlasc.cli.regrid import regrid
@@ -146,7 +146,7 @@ def test_declared_options_that_are_not_given_are_left_to_the_library():
     def command(options: DeclaredOptions) -> None:
         seen.append(dict(options.values))
 
-    flat = flatten(command, convert.declared_options(["nuscenes"]))
+    flat = flatten(command, declared_by("converter", ["nuscenes"]))
     names = list(inspect.signature(flat).parameters)
     flat(**dict.fromkeys(names))
     flat(**dict.fromkeys(names) | {names[-1]: False})

@@ -45,6 +45,7 @@ def test_a_store_unpacks_to_the_files_of_a_folder(kitti, tmp_path, workers):
     assert (again.made, again.skipped) == (0, 23)
 
 
+@pytest.mark.slow
 def test_a_frame_that_fails_is_added_when_it_is_corrected(kitti, tmp_path):
     write_tiny_kitti(tmp_path / "kitti", "00", 20)
     scan = tmp_path / "kitti/sequences/00/velodyne/000017.bin"

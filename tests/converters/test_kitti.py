@@ -193,6 +193,7 @@ def test_grids_are_made_from_scans_where_unlabelled_points_cast_no_vote(simulate
     assert len(sequence_of(tmp_path / "out").read("points", 1)) == 2000
 
 
+@pytest.mark.slow
 def test_cylindrical_grids_stand_beside(tmp_path):
     from carlasc.core.grids import GridSpec
 

@@ -61,6 +61,7 @@ def test_a_run_writes_weights_checkpoint_settings_and_curves(data, tmp_path, cap
     assert len(events.Tags()["images"]) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("network", ["lmscnet_ss", "sscnet", "js3cnet"])
 def test_a_resumed_run_ends_with_the_weights_of_one_that_was_never_stopped(data, tmp_path, network):
     config = replace(QUICK, network=network, free_ratio=2.0)
@@ -147,6 +148,7 @@ def test_training_stops_early_when_nothing_gets_better(data, tmp_path):
     assert (progress.best_epoch, progress.epoch) == (1, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [

@@ -62,6 +62,7 @@ def the_sequence(drive):
     return sequence
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("known_evidence")
 def test_evidence_is_written_beside_the_grid_also_of_one_that_is_there(drive):
     run(drive)
@@ -85,6 +86,7 @@ def test_evidence_is_written_beside_the_grid_also_of_one_that_is_there(drive):
     assert "min_confidence" not in json.loads((drive / GRID / "params.json").read_text())["carlasc"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("known_evidence")
 def test_the_report_says_how_much_was_inferred(drive):
     run(drive)

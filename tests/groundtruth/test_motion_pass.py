@@ -208,6 +208,7 @@ class TestPass:
         run(street, "none", (4, 5), motion=MotionOptions("none"))
         assert len(passes) == 2  # nothing is asked about motion
 
+    @pytest.mark.slow
     def test_two_workers_find_the_same_as_one(self, street):
         one = run(street, "one", (3, 6))
         kept = kept_in(street).read_bytes()
@@ -246,6 +247,7 @@ class TestPass:
             assert list(done) == sorted(set(done)) and (done[0], done[-1]) == (0, scans + 2)
 
 
+@pytest.mark.slow
 def test_the_file_depends_on_what_the_actors_are_made_from(street):
     folder = street / "cartesian" / layout.DERIVED
     settings = (

@@ -124,6 +124,7 @@ def kept_in(folder):
     return file
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("labelled", [True, False])
 def test_grids_under_wrong_poses_become_those_under_exact_ones(drive, wrong, tmp_path, labelled):
     true = write(drive, tmp_path / "true", drive[1], labelled)
@@ -152,6 +153,7 @@ def test_exact_poses_give_the_same_bytes_whether_they_may_be_refined_or_not(driv
     assert trees[0] == trees[1]
 
 
+@pytest.mark.slow
 def test_what_was_given_stays_and_the_record_says_how_poses_were_used(folder, wrong):
     before = (folder / "cartesian" / layout.POSES).read_bytes()
     make(folder)
@@ -194,6 +196,7 @@ def test_what_is_kept_and_damaged_is_made_again(folder, passes, data):
     assert len(passes) == 2 and kept_in(folder).read_bytes() == good
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_bytes_of_one(drive, wrong, folder, tmp_path):
     make(folder, frames=(10, 14))
     other = write(drive, tmp_path / "other", wrong)
@@ -207,6 +210,7 @@ def test_a_scan_that_cannot_be_read_is_left_out_of_the_refinement(folder):
     assert make(folder, frames=(10, 12), window=(-5, 5), motion=MotionOptions("none")).made == 2
 
 
+@pytest.mark.slow
 def test_poses_that_cannot_be_refined_are_said_so(drive, tmp_path):
     other = drive[1].copy()
     move(other, np.arange(FRAMES)[:, None] * (0.0, 0.0, 0.0, 0.0, 0.0, 0.02), 0)
@@ -256,6 +260,7 @@ def test_frames_without_a_scan_get_the_correction_of_the_one_before(drive, wrong
     assert np.abs(np.delete(off, 5, axis=0)[8:, :3, 3]).max() < 0.03
 
 
+@pytest.mark.slow
 def test_the_report_says_how_poses_were_refined(folder, drive, tmp_path):
     make(folder)
     made = next(iter(carlasc.report(folder, run=Run(workers=1)).reports.values()))
@@ -283,6 +288,7 @@ def test_the_report_says_how_poses_were_refined(folder, drive, tmp_path):
     assert dict(describe(report))["poses"].startswith("as given: neighbouring scans agree within ")
 
 
+@pytest.mark.slow
 def test_held_out_rays_get_better_and_are_measured_before_and_after(folder, drive, tmp_path):
     steps = []
     run = Run(workers=1, progress=lambda *step: steps.append(step))

@@ -85,6 +85,7 @@ def test_the_report_waits_for_a_frame_that_failed(tmp_path):
     assert json.loads(report.read_bytes())["frames"] == [[0, 3]]
 
 
+@pytest.mark.slow
 def test_scans_are_merged_over_the_borders_of_parts(source, tmp_path):
     regrid(source[0], SPEC, tmp_path / "scans", run=Run(workers=1))
     options = {

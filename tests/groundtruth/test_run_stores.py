@@ -41,6 +41,7 @@ def test_a_store_unpacks_to_the_files_of_a_folder(source, tmp_path):
     assert read_tree(tmp_path / "x") == source[1]
 
 
+@pytest.mark.slow
 def test_two_processes_and_any_order_of_parts_make_the_same_store(source, tmp_path):
     regrid(source[0], SPEC, tmp_path / "two.zarr", run=Run(workers=2))
     assert read_tree(tmp_path / "two.zarr") == source[2]
@@ -63,6 +64,7 @@ def test_a_run_on_a_finished_store_finds_that_everything_exists(source, tmp_path
         )
 
 
+@pytest.mark.slow
 def test_a_grid_is_added_to_a_store_that_can_be_read_meanwhile(source, tmp_path):
     regrid(source[0], SPEC, tmp_path / "x.zarr", run=Run(workers=1))
     before = carlasc.open(tmp_path / "x.zarr").sequences()["cartesian"]
@@ -172,9 +174,9 @@ def test_the_clocks_of_machines_do_not_matter(source, tmp_path):
 def test_a_disk_that_is_full_ends_the_command_and_the_next_one_finishes(
     source, tmp_path, monkeypatch
 ):
-    from carlasc.storage.transport import targets
+    from carlasc.storage.transport import trees
 
-    write, left = targets.write_atomic, [6]
+    write, left = trees.write_atomic, [6]
 
     def full(path, content, **options):
         left[0] -= 1
@@ -182,10 +184,10 @@ def test_a_disk_that_is_full_ends_the_command_and_the_next_one_finishes(
             raise StorageError(path, problem="cannot be written: No space left on device")
         return write(path, content, **options)
 
-    monkeypatch.setattr(targets, "write_atomic", full)
+    monkeypatch.setattr(trees, "write_atomic", full)
     with pytest.raises(StorageError, match="No space left"):
         regrid(source[0], SPEC, tmp_path / "x.zarr", run=Run(workers=1))
-    monkeypatch.setattr(targets, "write_atomic", write)
+    monkeypatch.setattr(trees, "write_atomic", write)
     regrid(source[0], SPEC, tmp_path / "x.zarr", run=Run(workers=1))
     assert read_tree(tmp_path / "x.zarr") == source[2]
 

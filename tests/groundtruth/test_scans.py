@@ -106,6 +106,7 @@ def test_static_voxels_are_the_same_whatever_becomes_of_moving_actors(street, sc
         assert (grid.counts[left] == grids[0].counts[left]).all()
 
 
+@pytest.mark.slow
 def test_numbered_points_do_as_well_as_flow(tmp_path, truth, scores):
     street = passing_car.write_sequence(tmp_path, ("labels", "instances"))
     make(street, "by_instances")
@@ -133,6 +134,7 @@ def test_a_frame_does_not_depend_on_which_frames_a_run_makes(street):
     assert (grid_of(street, "alone", 24).counts == grid_of(street, "together", 24).counts).all()
 
 
+@pytest.mark.slow
 def test_processes_make_the_same_grids(street):
     make(street, "one", frames=(18, 22))
     carlasc.regrid(

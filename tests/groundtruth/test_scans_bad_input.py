@@ -81,6 +81,7 @@ def noise(frame, ids):
     return np.random.default_rng(frame).integers(0, 20, len(ids)).astype(np.uint32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [swapped, one_number, a_number_per_scan, noise])
 def test_wrong_numbers_of_actors_do_not_swallow_the_road(street, good, wrong):
     change(street, "instances", wrong)

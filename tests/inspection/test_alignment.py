@@ -86,6 +86,7 @@ def test_mirrored_points_are_named_as_mirrored_poses_are(swaying):
     assert "y mirrored" in correction.name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rolling", [False, True])
 @pytest.mark.parametrize("speed", [0.0, 12.0])
 def test_correct_poses_raise_no_alarm(speed, rolling):

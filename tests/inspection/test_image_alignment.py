@@ -57,6 +57,7 @@ def test_images_that_fit_are_said_to_fit(tmp_path):
     assert not found.is_wrong
 
 
+@pytest.mark.slow
 def test_a_shift_of_the_image_is_a_warning_with_its_pixels(tmp_path):
     found = agreement(write(tmp_path, shift=8))
     assert found.shift_px == pytest.approx(8, abs=2) and found.is_wrong

@@ -37,6 +37,7 @@ def test_correct_poses_need_no_explanation(winding, jitter_m):
     assert describe_mounting(mounting) is None
 
 
+@pytest.mark.slow
 def test_scans_that_are_not_corrected_for_motion_raise_no_alarm():
     assert not mounting_of(*record(rolling=True)).wrong[:6].any()
 
@@ -61,6 +62,7 @@ def test_poses_of_another_point_are_told_where_the_sensor_is(winding, arm_m, yaw
     assert np.abs(off).max() < (0.03 if jitter_m == 0 else 0.25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late", [-1.0, 0.5, 2.0])
 @pytest.mark.parametrize("kind", [Winding, Straight])
 def test_late_poses_are_told_by_how_much(winding, kind, late):
@@ -71,6 +73,7 @@ def test_late_poses_are_told_by_how_much(winding, kind, late):
     assert mounting.wrong.tolist() == [False] * 6 + [True]
 
 
+@pytest.mark.slow
 def test_a_straight_drive_shows_no_lever_arm():
     scans, poses = record(Straight)
     mounting = mounting_of(scans, poses @ translation((0.8, -0.3, 0.8)))

@@ -166,6 +166,7 @@ def test_a_prediction_beside_the_data_is_judged_by_its_own_classes_and_not_as_tr
     assert "class ids of carlasc11" in found(validate(copy, every=1))["class-ids"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["zarr", "h5"])
 def test_a_packed_store_is_as_sound_as_what_it_was_packed_from(
     turning: Path, tmp_path: Path, ending: str

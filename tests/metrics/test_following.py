@@ -32,6 +32,7 @@ def sampled(solid, spec, origin, point, steps=20000):
     return middle, passed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (-4.0, 0.3, 0.2), (0.1, 0.2, 3.0)])
 def test_rays_meet_and_pass_what_dense_samples_meet_and_pass(origin):
     rng = np.random.default_rng(3)

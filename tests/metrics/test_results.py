@@ -31,6 +31,7 @@ def test_an_interval_holds_the_score_and_is_wide_where_sequences_differ():
     assert bootstrap(list(matrices([0.6] * 8).values()), accuracy) == alike
 
 
+@pytest.mark.slow
 def test_95_percent_of_intervals_hold_the_true_value():
     rng = np.random.default_rng(1)
     held = 0
@@ -56,6 +57,7 @@ def test_a_clear_difference_is_seen():
     assert found.sequences == tuple(sorted(base))
 
 
+@pytest.mark.slow
 def test_the_test_of_equals_is_wrong_as_often_as_it_says():
     rng = np.random.default_rng(6)
     p_values = []

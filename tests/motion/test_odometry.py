@@ -149,6 +149,7 @@ def long_street(speed):
         yield Thing("car", (ahead, rng.choice([0.0, 3.5, -3.5]), 0.8), (4.4, 1.8, 1.5), speed=speed)
 
 
+@pytest.mark.slow
 def test_a_drive_may_start_fast_at_a_low_rate():
     things = tuple(long_street(11.0))
     drive = SimulatedDrive(

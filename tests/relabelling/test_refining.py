@@ -261,6 +261,7 @@ refine(sys.argv[1], sys.argv[2], run=Run(workers=1, progress=progress))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("when", ["25", "total"])
 def test_an_interrupted_run_is_continued_by_the_same_call_and_by_no_other(data, tmp_path, when):
     out = tmp_path / "out"
@@ -285,6 +286,7 @@ def test_an_interrupted_run_is_continued_by_the_same_call_and_by_no_other(data, 
     assert not list(tmp_path.glob("out.*"))
 
 
+@pytest.mark.slow
 def test_several_processes_parts_and_packed_sources_make_the_same_files(data, tmp_path):
     carlasc.refine(data, tmp_path / "alone", run=ALONE)
     steps = []
@@ -302,6 +304,7 @@ def test_several_processes_parts_and_packed_sources_make_the_same_files(data, tm
         assert files_of(tmp_path / name) == files_of(tmp_path / "alone"), name
 
 
+@pytest.mark.slow
 def test_a_refined_data_set_is_valid_and_is_regridded_without_refining_again(data, tmp_path):
     carlasc.refine(data, tmp_path / "out", run=ALONE)
     assert not [
@@ -327,6 +330,7 @@ def test_wrong_arguments_and_wrong_poses_are_refused_before_anything_is_written(
     assert result.sequences == [ONE, TWO]
 
 
+@pytest.mark.slow
 def test_poses_of_another_point_and_late_ones_are_corrected(tmp_path):
     scans, true = record(frames=40)
     numbers = np.arange(len(true), dtype=np.float64)

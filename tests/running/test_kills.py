@@ -103,6 +103,7 @@ def test_processes_of_our_own_are_killed(kills, tmp_path: Path):
     work_until_killed_often_enough(Killer(kills), tmp_path, None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "is_first", [True, False], ids=["before it is started", "after it was started"]
 )

@@ -99,6 +99,7 @@ def run(ending: str, examples: int) -> None:
     run_state_machine_as_test(machine, settings=chosen)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", MACHINES)
 def test_a_store_has_what_a_model_in_memory_has_after_kills_and_resumed_runs(ending: str) -> None:
     run(ending, 6)

@@ -145,6 +145,7 @@ def frames(draw: st.DrawFn) -> list[dict[str, np.ndarray]]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "small"), [*((kind, False) for kind in KINDS), ("zarr", True)])
 @settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
 @given(sequence=frames(), poses=st.binary(max_size=30), first=st.sampled_from([0, 7, 999_998]))
@@ -410,6 +411,7 @@ def test_a_killed_unpack_continues_file_by_file(data: Path, tmp_path: Path) -> N
     assert files_of(tmp_path / "files") == files_of(data)
 
 
+@pytest.mark.slow
 def test_the_memory_does_not_grow_with_the_sequence(tmp_path: Path) -> None:
     script = "import resource, sys; from carlasc.storage.packing import pack; pack(sys.argv[1], sys.argv[2]);"
     script += "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"

@@ -347,6 +347,7 @@ def test_it_returns_what_the_capture_on_disk_holds(written):
         simulated.read(0, 8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["folder", "zarr"])
 def test_grids_are_made_without_files_in_between(written, tmp_path, kind):
     out = tmp_path / ("grids" if kind == "folder" else "grids.zarr")
@@ -364,6 +365,7 @@ def test_it_has_no_scans_to_merge_and_no_place_to_write_to(tmp_path):
         regrid(SimulatedCapture(**HOW), SPEC)
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_store_or_grids_if_it_is_asked_to(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     options = [

@@ -82,12 +82,14 @@ CONSTANTS: dict[str, dict[str, str]] = {
     "docs/sets/bag.md": {
         "4 ms": "scan-duration",
         "0.6 s": "scan-duration[1]",
+        "3 s": "longest-scan",
     },
     "docs/sets/carlaocc.md": {"0.1 s": "carlaocc-period"},
     "docs/sets/kitti-tracking.md": {"0.1033 s": "kitti-tracking-period"},
     "docs/sets/scans.md": {
         "4 ms": "scan-duration",
         "0.6 s": "scan-duration[1]",
+        "3 s": "longest-scan",
         "0.1 s": "frame-period",
     },
     "docs/sets/semanticposs.md": {"0.1 s": "frame-period"},

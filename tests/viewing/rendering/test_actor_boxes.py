@@ -104,6 +104,7 @@ def pixels(path):
     return np.asarray(Image.open(path).convert("RGB")).astype(int)
 
 
+@pytest.mark.slow
 def test_annotated_boxes_are_drawn_where_they_are_and_only_in_the_picture(blocks, tmp_path):
     folder = tmp_path / "Train" / "Town01_Light" / "cartesian"
     shutil.copytree(blocks, folder)
