@@ -37,7 +37,7 @@ class WrongAnswerError(Exception):
 
 
 class WholeFileError(WrongAnswerError):
-    """The answer of a server is the whole file instead of a range."""
+    """The answer of a server that has no ranges: the whole file. The request is not sent again."""
 
 
 class StatusError(Exception):
@@ -54,7 +54,7 @@ class StatusError(Exception):
 
 def is_temporary(error: BaseException) -> bool:
     """Whether a request that failed with an error may succeed when it is sent again."""
-    if is_offline(error):
+    if is_offline(error) or isinstance(error, WholeFileError):
         return False
     if _is_of_connection(error):
         return True

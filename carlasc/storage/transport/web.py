@@ -129,7 +129,10 @@ class WebClient(Client):
                 raise StatusError(answer.status)
             if start is not None and end is not None:
                 if answer.status != PARTIAL:
-                    raise WholeFileError("the whole file instead of a range")
+                    # A server that announces ranges may send one when it is asked again.
+                    has_ranges = answer.headers.get("Accept-Ranges") == "bytes"
+                    kind = WrongAnswerError if has_ranges else WholeFileError
+                    raise kind("the whole file instead of a range")
                 check_range(answer.headers.get("Content-Range"), start, end)
             data = bytearray()
             for piece in self.pieces(answer):

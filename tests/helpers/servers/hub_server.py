@@ -123,6 +123,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _send(self, status: int, data: bytes, error: str = "", content_range: str = "") -> None:
         self.send_response(status)
         self.send_header("Content-Length", str(len(data)))
+        self.send_header("Accept-Ranges", "bytes")  # as the servers of the Hub do
         if error:
             self.send_header("X-Error-Code", error)
         if content_range:
