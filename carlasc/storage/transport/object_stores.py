@@ -251,7 +251,8 @@ def _library() -> ModuleType:
 
 
 def _load_copy() -> None:
-    if not sys.platform.startswith("linux"):
+    make_file = getattr(os, "memfd_create", None)  # of Linux
+    if make_file is None:
         raise CarlascError(
             "a forked process",
             problem="cannot send requests to object stores",
@@ -260,7 +261,7 @@ def _load_copy() -> None:
     installed = str(sys.modules[PRIVATE].__file__)
     for name in [name for name in sys.modules if name.partition(".")[0] == "obstore"]:
         del sys.modules[name]
-    with open(os.memfd_create("obstore"), "wb") as file:
+    with open(make_file("obstore"), "wb") as file:
         file.write(Path(installed).read_bytes())
         file.flush()
         loader = ExtensionFileLoader(PRIVATE, f"/proc/self/fd/{file.fileno()}")
