@@ -19,10 +19,12 @@ from carlasc.converting.plans import SplitName, choose_recordings, plan_recordin
 from carlasc.converting.protocol import Converter, Failure, Recording, check_outside
 from carlasc.converting.registry import find_recordings, open_converter
 from carlasc.converting.stages import Conversion
+from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError, check_choice
 from carlasc.groundtruth.options import FromScans, GridOptions, Voting, fit_to_ground
 from carlasc.groundtruth.run import regrid
+from carlasc.inspection.findings import Finding
 from carlasc.motion.ground import Ground, joined
 from carlasc.motion.options import PoseOptions
 from carlasc.running.processes import one_pool
@@ -52,6 +54,7 @@ class ConvertResult:
         failures: frames that could not be converted, or whose grid could not be made.
         grids: locations of the grids that were made from scans.
         notes: remarks about the result, one line each.
+        findings: what is probably wrong; carlasc.json of each sequence has them, too.
         elapsed_s: duration in seconds.
     """
 
@@ -61,6 +64,7 @@ class ConvertResult:
     failures: tuple[Failure, ...]
     grids: tuple[str, ...]
     notes: tuple[str, ...]
+    findings: tuple[Finding, ...]
     elapsed_s: float
 
 
@@ -70,6 +74,7 @@ def convert(
     out: AnyPath | Sink,
     *,
     sequences: Collection[str] | None = None,
+    frames: Frames = None,
     split: SplitName = "all",
     layout: LayoutOptions = LayoutOptions(),  # noqa: B008 (frozen)
     poses: PoseOptions = PoseOptions(),  # noqa: B008 (frozen)
@@ -91,6 +96,7 @@ def convert(
         out: where to write: a folder or a `.zarr` store, on this machine or in an object store; or
             any Sink, with grids if it can be read while it is written.
         sequences: which ones, by their names or the last part of them ("00"); None converts all.
+        frames: numbers of the frames to convert, of every sequence; None converts all.
         split: "train", "val" or "test": only sequences of this split; "all" converts every split.
         layout: how sequences are written: their classes, their axes, and whether they get flow.
         poses: where poses come from, and whether poses are accepted if scans do not overlap under
@@ -128,7 +134,15 @@ def convert(
     plans = []
     for one in recordings:
         planned = plan_recording(
-            one, converter, sink, target, poses, flow=has_flow, voxels=has_voxels
+            one,
+            converter,
+            sink,
+            target,
+            poses,
+            frames=FrameRange.of(frames),
+            level=layout.level,
+            flow=has_flow,
+            voxels=has_voxels,
         )
         plans.append(planned)
     origin = f"{name if isinstance(name, str) else name.__name__} {root.name}"
@@ -171,6 +185,7 @@ def convert(
         tuple(failures),
         () if made is None else made.grids,
         tuple(notes),
+        tuple(finding for plan in plans for finding in plan.findings),
         time.perf_counter() - start,
     )
 
