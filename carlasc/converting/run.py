@@ -151,7 +151,9 @@ def convert(
     known = {key: value for key, value in said.items() if value not in (None, False)}
     metadata = Metadata(layout.axes, target.classes, converter.sensor, *ranges, origin, known)
 
-    steps = StepCounter(run.progress, sum(len(plan.recording.frames) for plan in plans))
+    every = sum(len(plan.recording.frames) for plan in plans)
+    in_grids = every if isinstance(grids, GridOptions) else 0
+    steps = StepCounter(run.progress, every + in_grids)
     with one_pool(run) as pooled:
         conversions = [
             Conversion(plan, converter, target, layout.images, pooled, steps) for plan in plans
@@ -164,7 +166,7 @@ def convert(
             sink.finish(incomplete=True)  # missing frames could not be read, and are reported
         made = None
         if isinstance(grids, GridOptions):
-            alone = replace(pooled, part=Part(), progress=steps.stage())
+            alone = replace(pooled, part=Part(), progress=steps.stage(in_grids))
             converted = [conversion for conversion in conversions if conversion.has_scans]
             if converted:  # otherwise every frame failed, and is reported
                 scans = _ConvertedScans(sink, converted)
