@@ -252,6 +252,7 @@ class MotionJob:
         nearby: the labelled frames before and after it, if it has no labels and others have.
         labelled: whether its points have labels in the data set. Those that an interrupted run made
             from boxes are made again.
+        own: names of the fields that this run read of it in the data set; None if it read none.
     """
 
     handle: FrameHandle
@@ -262,6 +263,7 @@ class MotionJob:
     boxes: Boxes | None = None
     nearby: tuple[MotionJob, ...] = ()
     labelled: bool = True
+    own: frozenset[str] | None = None
 
 
 @dataclass(frozen=True)
@@ -289,7 +291,11 @@ class MotionStage:
         the data set.
         """
         number, writer = job.handle.number, self.writer
-        wanted = [name for name in names if job.labelled or name != "labels"]
+        wanted = [
+            name
+            for name in names
+            if (job.labelled or name != "labels") and (not job.own or name in job.own)
+        ]
         written = {name: writer.read(name, number) for name in wanted if writer.has(name, number)}
         if writer.has("points", number) and all(array is not None for array in written.values()):
             return {name: array for name, array in written.items() if array is not None}

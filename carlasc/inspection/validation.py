@@ -17,7 +17,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, CarlascError
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.options import FromScans
-from carlasc.groundtruth.reporting import Report, digest_of, short
+from carlasc.groundtruth.reporting import Report, short
 from carlasc.inspection.agreement import GridDiagnosis, GridEvidence, GroundBelow, check_actors
 from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses, static_structure
 from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values
@@ -36,6 +36,7 @@ from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath
 from carlasc.storage.folder import FolderSequence
+from carlasc.storage.inputs import digest_of
 from carlasc.storage.protocol import Sequence, Source
 
 _ADVICE = (
