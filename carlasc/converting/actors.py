@@ -59,7 +59,8 @@ Fields = Mapping[str, AnyArray]
 Velocity = tuple[float, float, float]
 """(vx, vy, vz) in m/s over ground, right-handed sensor frame."""
 
-_MAX_GAP = 10  # frames for which an actor may be hidden; a new path begins after a longer gap
+MAX_GAP = 10
+"""Frames for which an actor may be hidden; a new path begins after a longer gap."""
 _MAX_OBSERVATIONS = 400  # of one path
 _MAX_POINTS = 1000  # of one observation
 _FARTHEST_M = 1e4  # points farther than any LiDAR measures are damaged, as infinity and NaN are
@@ -202,7 +203,7 @@ class ActorMotion:
             chain = self._chains.get(observation.actor)
             if (
                 chain is None
-                or frame - chain.frames[-1] > _MAX_GAP
+                or frame - chain.frames[-1] > MAX_GAP
                 or len(chain.frames) >= _MAX_OBSERVATIONS
             ):
                 self._ended += [] if chain is None else [chain]
@@ -213,7 +214,7 @@ class ActorMotion:
             chain.poses.append(first_T_sensor)
             chain.points.append(observation.points)
         for actor in [
-            actor for actor, chain in self._chains.items() if frame - chain.frames[-1] > _MAX_GAP
+            actor for actor, chain in self._chains.items() if frame - chain.frames[-1] > MAX_GAP
         ]:
             self._ended.append(self._chains.pop(actor))
         if len(self._ended) >= _BATCH:

@@ -78,6 +78,7 @@ def convert(
     grids: Grids = GridOptions(),  # noqa: B008 (frozen)
     options: Mapping[str, Any] | None = None,
     compare_inputs: CompareInputs = "fast",
+    allow_gaps: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> ConvertResult:
     """Write another data set as sequences of the CarlaSC layout: the same files, axes and classes;
@@ -107,6 +108,8 @@ def convert(
         compare_inputs: how it is found out whether the data set changed: "fast": by the names,
             sizes and times of its files; "content": all frames are made again and compared;
             "never": existing frames are kept.
+        allow_gaps: finish frames that take labels, motion or votes from a frame that failed.
+            Otherwise they wait until it is repaired.
         run: how the work is spread. A part converts whole recordings, because poses and motion are
             estimated along each of them. Grids then keep their height, because the ground of the
             other recordings is not known.
@@ -152,7 +155,8 @@ def convert(
     steps = StepCounter(run.progress, sum(len(plan.recording.frames) for plan in plans))
     with one_pool(run) as pooled:
         conversions = [
-            Conversion(plan, converter, target, layout.images, pooled, steps) for plan in plans
+            Conversion(plan, converter, target, layout.images, pooled, steps, allow_gaps)
+            for plan in plans
         ]
         with ExitStack() as writers:
             for conversion in conversions:
@@ -165,7 +169,8 @@ def convert(
         made = None
         if isinstance(grids, GridOptions):
             alone = replace(pooled, part=Part(), progress=steps.stage())
-            converted = [conversion for conversion in conversions if conversion.has_scans]
+            # without the motion that some frames wait for, grids would be made in another way
+            converted = [one for one in conversions if one.has_scans and not one.waits]
             if converted:  # otherwise every frame failed, and is reported
                 scans = _ConvertedScans(sink, converted)
                 spec, observe, cut = _plan_grids(grids, converted, scans, poses)
@@ -203,14 +208,15 @@ class _ConvertedScans(Source):
 
     def __init__(self, sink: Sink, conversions: Series[Conversion]) -> None:
         self.location, self._source = sink.location, sink.source()
-        self._paths = {sequence_path(conversion.plan.recording) for conversion in conversions}
+        self._chosen = {sequence_path(one.plan.recording): one for one in conversions}
 
     def sequences(self) -> dict[str, Sequence]:
-        return {
-            path: sequence
-            for path, sequence in self._source.sequences().items()
-            if path in self._paths
-        }
+        found = self._source.sequences()
+        chosen = {path: found[path] for path in found if path in self._chosen}
+        for path, sequence in chosen.items():
+            conversion = self._chosen[path]
+            sequence.awaited = frozenset() if conversion.allow_gaps else conversion.failed
+        return chosen
 
 
 def _plan_grids(

@@ -11,16 +11,18 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
-from carlasc.converting.plans import RecordingPlan
+from carlasc.converting.plans import KISS_ICP, RecordingPlan
 from carlasc.converting.protocol import Recording
 from carlasc.converting.stages import Conversion
 from carlasc.core.choices import CompareInputs
 from carlasc.storage.inputs import MadeFrom, changed_names, combined, folder_states, made_again
 
 _NAME = "conversion"
-_DONE, _FAILED = "done", ""
+# the states of frames; others were finished without a frame that is a gap
+_DONE, _FAILED, _GAP = "done", "failed", "gap"
 
 
 @dataclass
@@ -48,13 +50,14 @@ class ConversionRecord:
                 where = self.plan.writer.location
                 self.notes.append(f"{where}: {made_again(conversion.changed, why)}")
         if self.states is not None:
-            self.write(conversion.failed)
+            has_gaps = conversion.allow_gaps or self.plan.pose_source == KISS_ICP
+            self.write(dict.fromkeys(conversion.failed, _GAP if has_gaps else _FAILED))
 
-    def write(self, failed: Iterable[int] = ()) -> None:
+    def write(self, failed: Mapping[int, str] = MappingProxyType({})) -> None:
         """Write the record of the states of now."""
-        own, bad = dict(self.states or {}), set(failed)
+        own = dict(self.states or {})
         numbers = [handle.number for handle in self.plan.recording.frames]
-        frames = {str(number): _FAILED if number in bad else _DONE for number in numbers}
+        frames = {str(number): failed.get(number, _DONE) for number in numbers}
         MadeFrom(combined(sorted(own.items())), own, frames).write(self.plan.writer, _NAME)
 
 
@@ -108,7 +111,8 @@ class SourceFiles:
         states = {**self.states[None], **self.states.get(plan.recording.location, {})}
         exists = len(plan.missing) < len(plan.recording.frames)
         record = ConversionRecord(plan, before, states)
-        if exists and (self.compare == "content" or before.own != states):
+        is_other = before.own != states or _GAP in before.frames.values()
+        if exists and (is_other or self.compare == "content"):
             plan.make_again()
         else:
             record.write()

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from carlasc.converting.actors import (
+    MAX_GAP,
     ActorMotion,
     ActorObservation,
     Fields,
@@ -238,6 +239,11 @@ def write_frames(writer: SequenceWriter, frames: Iterable[ConvertedFrame]) -> No
         frame.fields = {}
 
 
+def waits_for(failed: int) -> str:
+    """Return why a frame is not finished: another one failed."""
+    return f"frame {failed}, which failed: repair that one, or finish with `allow_gaps=True`"
+
+
 def in_blocks(
     handles: Sequence[FrameHandle], writer: SequenceWriter
 ) -> Iterator[Sequence[FrameHandle]]:
@@ -265,6 +271,7 @@ class Conversion:
         steps: called after each frame of each stage.
         failures: frames that failed.
         notes: remarks about the result, one line each.
+        allow_gaps: whether frames are finished that take labels or motion from a frame that failed.
         ground: the ground in some of its scans; None if none was found, or scans cannot be read
             back.
     """
@@ -275,10 +282,12 @@ class Conversion:
     images: Images
     run_options: Run
     steps: StepCounter
+    allow_gaps: bool = False
     failures: list[Failure] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     ground: Ground | None = None
     _failed: set[int] = field(default_factory=set)
+    _held: set[int] = field(default_factory=set)
     _changed: set[int] = field(default_factory=set)
     _names: dict[int, frozenset[str]] = field(default_factory=dict)
     _unnumbered: int = 0
@@ -332,11 +341,17 @@ class Conversion:
             ]
             if others and number not in self._failed:
                 plan.writer.remove_frames(others, [number])
+                self._changed.add(number)
 
     @property
     def changed(self) -> frozenset[int]:
         """Numbers of the frames that were not in the output already."""
         return frozenset(self._changed)
+
+    @property
+    def waits(self) -> bool:
+        """Whether any frame waits for one that failed. The grids of the recording then wait too."""
+        return bool(self._held)
 
     @property
     def failed(self) -> frozenset[int]:
@@ -347,12 +362,13 @@ class Conversion:
     def made(self) -> int:
         """Number of frames that were converted."""
         made = self._changed if self.plan.again else self.plan.unfinished
-        return len(made - self._failed)
+        return len(made - self._failed - self._held)
 
     @property
     def skipped(self) -> int:
         """Number of frames that were kept."""
-        return len(self.plan.recording.frames) - len(self._failed) - self.made
+        kept = {handle.number for handle in self.plan.recording.frames} - self._failed - self._held
+        return len(kept) - self.made
 
     @property
     def has_scans(self) -> bool:
@@ -462,10 +478,20 @@ class Conversion:
     def _finish(self, velocities: Mapping[int, Mapping[int, Velocity]]) -> None:
         """Add labels, instances, boxes and flow from the motion of actors."""
         plan = self.plan
+        todo = plan.unfinished - self._failed if plan.added else set[int]()
+        waiting = {} if self.allow_gaps else self._waiting(velocities)
+        self.failures += [
+            Failure(
+                plan.recording.location,
+                number,
+                f"{plan.recording.location}: frame {number} waits for {waits_for(failed)}",
+            )
+            for number, failed in sorted(waiting.items())
+            if number in todo
+        ]
+        self._held |= waiting.keys() & todo
         wanted = [
-            handle
-            for handle in plan.recording.frames
-            if plan.added and handle.number in plan.unfinished and handle.number not in self._failed
+            handle for handle in plan.recording.frames if handle.number in todo - waiting.keys()
         ]
         if not wanted or plan.poses is None:
             return
@@ -491,6 +517,30 @@ class Conversion:
             blocks.append(Block(stage, tuple(jobs), plan.again))
         deque(self._work(blocks), maxlen=0)  # frames are written; nothing is kept
 
+    def _waiting(self, velocities: Mapping[int, Mapping[int, Velocity]]) -> dict[int, int]:
+        """Return the frames that take labels or motion from a frame that failed, each with the
+        number of that frame.
+        """
+        waiting = dict[int, int]()
+        frames: dict[int, list[int]] = {}
+        for number, actors in velocities.items():
+            for actor in actors:
+                frames.setdefault(actor, []).append(number)
+        for own in frames.values():
+            reach = range(min(own) - MAX_GAP, max(own) + MAX_GAP + 1)
+            failed = [number for number in sorted(self._failed) if number in reach]
+            waiting |= dict.fromkeys(own, failed[0]) if failed else {}
+        for handle in self.plan.recording.frames if self.plan.recording.has_labels else ():
+            near = [] if handle.labelled else self._neighbours(handle)
+            failed = [other.number for other in near if other.number in self._failed]
+            waiting |= {handle.number: failed[0]} if failed else {}
+        return waiting
+
+    def _neighbours(self, handle: FrameHandle) -> list[FrameHandle]:
+        """Return the frames with labels of their own before and after a frame."""
+        place = bisect(self._labelled, handle.number, key=attrgetter("number"))
+        return self._labelled[max(place - 1, 0) : place + 1]
+
     def _labelled_around(self, handle: FrameHandle) -> tuple[MotionJob, ...]:
         """Return the labelled frames before and after an unlabelled frame of a recording with
         labels.
@@ -498,8 +548,6 @@ class Conversion:
         plan = self.plan
         if handle.labelled or not plan.recording.has_labels or plan.poses is None:
             return ()
-        place = bisect(self._labelled, handle.number, key=attrgetter("number"))
-        near = self._labelled[max(place - 1, 0) : place + 1]
         return tuple(
             MotionJob(
                 other,
@@ -507,16 +555,16 @@ class Conversion:
                 plan.poses[other.number],
                 own=self._names.get(other.number),
             )
-            for other in near
+            for other in self._neighbours(handle)
         )
 
     @cached_property
     def _labelled(self) -> list[FrameHandle]:
-        """The frames with labels of their own."""
+        """The frames with labels of their own; without `allow_gaps`, also those that failed."""
         return [
             handle
             for handle in self.plan.recording.frames
-            if handle.labelled and handle.number not in self._failed
+            if handle.labelled and not (self.allow_gaps and handle.number in self._failed)
         ]
 
     def _box_tracks(self) -> tuple[list[Track] | None, dict[int, Boxes]]:
@@ -557,6 +605,8 @@ class Conversion:
     def _remarks(self) -> list[str]:
         plan = self.plan
         notes = [*plan.recording.notes(), *plan.notes]
+        if self.waits:
+            notes.append("its grids wait, too, until all frames are converted")
         unlabelled = sum(not handle.labelled for handle in plan.recording.frames)
         if plan.boxes is not None and not plan.recording.has_labels:
             notes.append(
@@ -633,7 +683,7 @@ def _copy_images(plan: RecordingPlan, cameras: Sequence[CameraModel]) -> list[st
     for handle in plan.recording.frames:
         blocks.setdefault(handle.number // plan.writer.block, []).append(handle.number)
     for numbers in blocks.values():
-        by_frame: dict[int, dict[str, np.ndarray]] = {}
+        by_frame: dict[int, dict[str, AnyArray]] = {}
         for number in numbers:
             for camera in cameras:
                 if not plan.again and any(
@@ -645,8 +695,8 @@ def _copy_images(plan: RecordingPlan, cameras: Sequence[CameraModel]) -> list[st
                     missing += 1
                     continue
                 made = {f"images.{camera.name}.{image[0]}": np.frombuffer(image[1], np.uint8)}
-                if made := _different(plan.writer, number, made):
-                    by_frame.setdefault(number, {}).update(made)
+                by_frame.setdefault(number, {}).update(_different(plan.writer, number, made))
+        by_frame = {number: own for number, own in by_frame.items() if own}
         if by_frame:
             plan.writer.write_frames(by_frame)
     note = f"{missing} images of cameras do not exist, or are neither .jpg nor .png"

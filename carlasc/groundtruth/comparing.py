@@ -53,6 +53,7 @@ class InputCheck:
     _whole: str = ""
     _made: dict[int, str] = field(default_factory=dict)
     _is_prepared: bool = False
+    _has_begun: bool = False
 
     @property
     def replaced(self) -> frozenset[int]:
@@ -128,20 +129,22 @@ class InputCheck:
         )
 
     def begin(self, numbers: Collection[int], missing: Collection[int]) -> None:
-        """Write the record of the frames that are about to be made, and remove frames of which the
-        input has no scan any more. The sequence is prepared.
+        """Write the record of the frames that are about to be made, once, and remove frames of which
+        the input has no scan any more. The sequence is prepared.
 
         Args:
             numbers: all frames of the run.
             missing: those that do not exist.
         """
-        if not self._whole:
+        if not self._whole or self._has_begun:
             return
-        record, inputs = self._record, self.inputs
+        record, inputs, self._has_begun = self._record, self.inputs, True
         if self.gone:
             self.writer.remove_frames(inputs.written(self.writer, self.grid), self.gone)
         changed = {
-            int(frame) for frame, own in self._own.items() if record.own.get(frame, own) != own
+            frame.number
+            for frame in inputs.frames
+            if record.own.get(str(frame.source_frame), "") != self._own[str(frame.source_frame)]
         }
         record.replaced = tuple(sorted({*record.replaced, *(self.stale & changed)}))
         for frame in self.gone:

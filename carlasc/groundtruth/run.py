@@ -664,7 +664,6 @@ class Work:
             for job, todo, missing in zip(self.jobs, every, ours, strict=True):
                 if missing:
                     job.check.prepare(self.spread, steps)
-                if missing or job.check.must_record:
                     job.check.begin(job.numbers, todo)
                 for batch in _batches(job, job.tasks(missing)):
                     under_way.append(job)
@@ -708,6 +707,7 @@ class Work:
         if not (is_reported or (self.spread.part.count > 1 and job.missing())):
             self._report(job, made, tried)
         if made or job.check.must_record:
+            job.check.begin(job.numbers, ())  # if no frame was made
             job.check.finish({done.task.number for done in made if done.error is None})
 
     def _report(self, job: SequenceJob, made: list[FrameResult], tried: Set[int]) -> None:

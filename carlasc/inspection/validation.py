@@ -30,6 +30,7 @@ from carlasc.inspection.findings import (
 )
 from carlasc.inspection.image_alignment import compare_images, judge_images
 from carlasc.inspection.pose_quality import check_poses, check_times, describe_mounting
+from carlasc.inspection.staleness import check_inputs
 from carlasc.motion.ground import ground_of
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
@@ -220,6 +221,7 @@ def _examine(plan: _CheckedFrames, step: Callable[[], None] = lambda: None) -> _
         step()
     if described:
         findings.extend(check_reports(sequence, plan.read))
+        findings.extend(check_inputs(sequence))
     shares = {}
     for name, grid in evidence.items():
         diagnosis = grid.diagnose()

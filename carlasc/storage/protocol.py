@@ -73,6 +73,8 @@ class Sequence(ABC):
         name: "Town01_Light".
         coordinates: "cartesian" or "cylindrical".
         tree: the tree of files that it is read from; None if it is not read from files.
+        awaited: frames whose scans could not be written yet. Grids to which they belong wait for
+            them.
     """
 
     path: str
@@ -81,6 +83,7 @@ class Sequence(ABC):
     name: str
     coordinates: Coordinates
     tree: FileTree | None = None
+    awaited: frozenset[int] = frozenset()
     _given_poses: FloatArray | None = None
 
     @abstractmethod

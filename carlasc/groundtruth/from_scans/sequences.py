@@ -99,7 +99,15 @@ class ScanFrame(FrameInput):
 
     def make(self, plan: GridPlan) -> FrameData:
         """Read the files of the frame, and count the votes of the scans in its window."""
-        feed = self.inputs.feed
+        feed, (first, last) = self.inputs.feed, self.inputs.feed.options.window
+        lost = [one for one in feed.sequence.awaited if first <= one - self.number <= last]
+        if lost:
+            raise MissingDataError(
+                f"frame {self.number}",
+                expected=f"the scan of frame {min(lost)}",
+                found="a frame that failed",
+                advice="repair that one, or finish without it with `allow_gaps=True`",
+            )
         fields = {name: feed.sequence.read(name, self.number) for name in self.fields()}
         window = feed.reaching(self.number, plan.spec)
         merged = merge_frame(plan, feed, self.inputs.actors, self.number, window)
