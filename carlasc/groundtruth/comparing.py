@@ -129,7 +129,7 @@ class InputCheck:
         )
 
     def begin(self, numbers: Collection[int], missing: Collection[int]) -> None:
-        """Write the record of the frames that are about to be made, once, and remove frames of which
+        """Write the record of the frames that are about to be made, once, and remove those of which
         the input has no scan any more. The sequence is prepared.
 
         Args:

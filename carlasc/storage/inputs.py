@@ -29,7 +29,7 @@ from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json, to_json
-from carlasc.storage.protocol import Sequence, SequenceWriter
+from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 from carlasc.storage.transport.trees import Tree
 
 _FORMAT = 1
@@ -188,6 +188,17 @@ def _states(files: FrameFiles, frames: list[int]) -> dict[int, str]:
         else _UNREADABLE
         for frame, own in paths.items()
     }
+
+
+def sequence_states(source: Source) -> dict[str, str]:
+    """Return the state of the text files and the scans of each sequence of a source, by path."""
+    states = {}
+    for path, sequence in source.sequences().items():
+        files = SequenceFiles(sequence, *(name for name in sequence.fields() if "/" not in name))
+        own = _states(files, sequence.scan_frames().tolist())
+        texts = [(name, sequence.read_document(name)) for name in sequence.documents()]
+        states[path] = combined(own, [text for text in texts if "/" not in text[0]])
+    return states
 
 
 def _read_rows(writer: SequenceWriter, document: str) -> dict[int, tuple[str, str]]:
