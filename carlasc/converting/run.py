@@ -21,10 +21,12 @@ from carlasc.converting.registry import find_recordings, open_converter
 from carlasc.converting.sources import SourceFiles
 from carlasc.converting.stages import Conversion
 from carlasc.core.choices import CompareInputs
+from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError, check_choice
 from carlasc.groundtruth.options import FromScans, GridOptions, Voting, fit_to_ground
 from carlasc.groundtruth.run import regrid
+from carlasc.inspection.findings import Finding
 from carlasc.motion.ground import Ground, joined
 from carlasc.motion.options import PoseOptions
 from carlasc.running.processes import one_pool
@@ -54,6 +56,7 @@ class ConvertResult:
         failures: frames that could not be converted, or whose grid could not be made.
         grids: locations of the grids that were made from scans.
         notes: remarks about the result, one line each.
+        findings: what is probably wrong; carlasc.json of each sequence has them, too.
         elapsed_s: duration in seconds.
     """
 
@@ -63,6 +66,7 @@ class ConvertResult:
     failures: tuple[Failure, ...]
     grids: tuple[str, ...]
     notes: tuple[str, ...]
+    findings: tuple[Finding, ...]
     elapsed_s: float
 
 
@@ -72,6 +76,7 @@ def convert(
     out: AnyPath | Sink,
     *,
     sequences: Collection[str] | None = None,
+    frames: Frames = None,
     split: SplitName = "all",
     layout: LayoutOptions = LayoutOptions(),  # noqa: B008 (frozen)
     poses: PoseOptions = PoseOptions(),  # noqa: B008 (frozen)
@@ -97,6 +102,7 @@ def convert(
         out: where to write: a folder or a `.zarr` store, on this machine or in an object store; or
             any Sink, with grids if it can be read while it is written.
         sequences: which ones, by their names or the last part of them ("00"); None converts all.
+        frames: numbers of the frames to convert, of every sequence; None converts all.
         split: "train", "val" or "test": only sequences of this split; "all" converts every split.
         layout: how sequences are written: their classes, their axes, and whether they get flow.
         poses: where poses come from, and whether poses are accepted if scans do not overlap under
@@ -141,7 +147,15 @@ def convert(
     plans = []
     for one in recordings:
         planned = plan_recording(
-            one, converter, sink, target, poses, flow=has_flow, voxels=has_voxels
+            one,
+            converter,
+            sink,
+            target,
+            poses,
+            frames=FrameRange.of(frames),
+            level=layout.level,
+            flow=has_flow,
+            voxels=has_voxels,
         )
         plans.append(planned)
     sources = SourceFiles.of(root, found, options, compare_inputs)
@@ -199,6 +213,7 @@ def convert(
         tuple(failures),
         () if made is None else made.grids,
         tuple(notes),
+        tuple(finding for plan in plans for finding in plan.findings),
         time.perf_counter() - start,
     )
 

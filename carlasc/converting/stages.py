@@ -42,9 +42,10 @@ from carlasc.converting.plans import (
     estimate_poses,
     fill_gaps,
     follow,
-    write_heights,
+    write_found,
     write_poses,
 )
+from carlasc.converting.plausibility import check_mount, find_mount
 from carlasc.converting.protocol import Converter, Failure, FrameHandle
 from carlasc.core.arrays import AnyArray, Float32Array, FloatArray
 from carlasc.core.boxes import Boxes
@@ -301,7 +302,12 @@ class Conversion:
             self.steps.expect(len(plan.recording.frames))
             plan.take_estimate(
                 estimate_poses(
-                    plan.recording, self.converter, plan.times, self.steps, self.run_options
+                    plan.recording,
+                    self.converter,
+                    plan.times,
+                    self.steps,
+                    self.run_options,
+                    plan.checked,
                 )
             )
             write_poses(plan, self.target)
@@ -440,7 +446,7 @@ class Conversion:
                     waiting[result.number] = result
                     yield result.number, (points, None)
 
-        for number, pose in follow(scans(), self.converter, self.plan.times):
+        for number, pose in follow(scans(), self.converter, self.plan.times, self.plan.checked):
             yield waiting.pop(number), pose
 
     def _work(self, blocks: Sequence[Block]) -> Iterator[ConvertedFrame]:
@@ -587,8 +593,8 @@ class Conversion:
         return tracks_from_boxes(boxes, poses, times), boxes
 
     def _find_ground(self) -> None:
-        """Find the ground in some of the scans, and write the height of the sensor if the data set
-        does not say it.
+        """Find the ground in some of the scans; write the height of the sensor if the data set
+        does not say it, and what was found.
         """
         plan, frames = self.plan, [handle.number for handle in self.plan.recording.frames]
         chosen = {frames[i] for i in np.linspace(0, len(frames) - 1, _GROUND_FRAMES).astype(int)}
@@ -599,8 +605,9 @@ class Conversion:
             and (points := plan.writer.read("points", number)) is not None
         ]
         self.ground = find_ground(scans)
-        if self.ground is not None:
-            write_heights(plan, self.ground.below_m)
+        if plan.recording.rays and not plan.findings:
+            plan.findings += check_mount(find_mount(scans), plan.recording.location, force=True)
+        write_found(plan, None if self.ground is None else self.ground.below_m)
 
     def _remarks(self) -> list[str]:
         plan = self.plan
