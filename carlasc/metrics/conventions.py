@@ -16,15 +16,21 @@ import numpy as np
 from carlasc.core.arrays import AnyArray, BoolArray, LabelArray, Uint8Array
 from carlasc.core.benchmarks import (
     IGNORED,
-    OCC3D,
     OCC3D_TO_OPENOCCUPANCY,
-    OPENOCCUPANCY,
-    SSCBENCH,
     TO_OCC3D,
     TO_SSCBENCH,
 )
 from carlasc.core.classes import ClassTable
-from carlasc.core.tables import CARLA, CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
+from carlasc.core.tables import (
+    CARLA,
+    CARLASC11,
+    OCC3D,
+    OPENOCCUPANCY,
+    REMAPS,
+    SEMANTICKITTI,
+    SEMANTICKITTI19,
+    SSCBENCH,
+)
 from carlasc.errors import FormatError, check_choice
 from carlasc.metrics.confusion import ConfusionMatrix
 

@@ -17,9 +17,9 @@ from typing import Literal
 import numpy as np
 
 from carlasc.core.arrays import AnyArray, BoolArray, IntArray, LabelArray, Uint8Array
-from carlasc.core.benchmarks import CARLAOCC
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.tables import CARLAOCC
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.storage import Sequence, layout
 from carlasc.storage.arrays import NUMBERS, ArrayFormat, check_size, open_npz

@@ -16,10 +16,9 @@ from typing import Literal
 import numpy as np
 
 from carlasc.core.arrays import BoolArray, IntArray, LabelArray
-from carlasc.core.benchmarks import OCC3D, OPENOCCUPANCY
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
-from carlasc.core.tables import SEMANTICKITTI
+from carlasc.core.tables import OCC3D, OPENOCCUPANCY, SEMANTICKITTI
 from carlasc.errors import FormatError, MissingDataError, first_names
 from carlasc.metrics.grids import GridFrames, LabelFolder, SeenBy, SequenceGrid, find_carlaocc
 from carlasc.storage import Sequence, Source, as_source, layout

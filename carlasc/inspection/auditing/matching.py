@@ -14,10 +14,8 @@ import numpy as np
 
 from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray, IntArray, LabelArray
 from carlasc.core.benchmarks import (
-    CARLAOCC,
     CARLAOCC_TO_CARLA,
     OCC3D_TO_OPENOCCUPANCY,
-    SSCBENCH_TO_RAW,
     TO_OCC3D,
     TO_SSCBENCH,
 )
@@ -25,7 +23,7 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.geometry import Transform, transform_points
 from carlasc.core.grids import GridSpec
-from carlasc.core.tables import remaps_between
+from carlasc.core.tables import CARLAOCC, SSCBENCH_TO_RAW, remaps_between
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, count, first_names, reading
 from carlasc.metrics.grids import CarlaOccGrids, GridFrames, SequenceGrid
 from carlasc.metrics.pairs import Place, TokenFrames, open_grids
