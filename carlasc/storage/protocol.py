@@ -206,6 +206,18 @@ class Sequence(ABC):
             return self.metadata.classes
         return table_from_json(table, f"{self.location}/{layout.params_file(grid)}")
 
+    def names_classes(self, grid: str = "") -> bool:
+        """Whether carlasc.json, or params.json of a grid, names the class table of its labels.
+
+        Otherwise the table of CARLA is assumed, as published files have it.
+        """
+        if grid and self._record(grid).get("classes") is not None:
+            return True
+        name = layout.METADATA
+        return name in self.documents() and "classes" in parse_json(
+            self.read_document(name), f"{self.location}/{name}"
+        )
+
     def predicted_by(self, grid: str) -> str | None:
         """Return the name of the network that predicted a grid, from its params.json; None if the
         grid is not a prediction.
