@@ -9,6 +9,7 @@ from .cameras import CameraModel as CameraModel
 from .classes import ClassTable as ClassTable
 from .classes import Color as Color
 from .classes import Remap as Remap
+from .classes import TableUse as TableUse
 from .classes import class_weights as class_weights
 from .frames import FrameRange as FrameRange
 from .frames import Frames as Frames

@@ -169,7 +169,10 @@ class ClassTable:
             names=dict(sorted(zip(swapped(self.names), self.names.values(), strict=True))),
             colors=dict(sorted(zip(swapped(self.colors), self.colors.values(), strict=True))),
             free=0,
-            **{role: frozenset(swapped(getattr(self, role))) for role in ROLES},
+            moving=frozenset(swapped(self.moving)),
+            movable=frozenset(swapped(self.movable)),
+            deformable=frozenset(swapped(self.deformable)),
+            ground=frozenset(swapped(self.ground)),
         )
 
     @cached_property
@@ -260,6 +263,32 @@ class ClassTable:
                 found=f"{times(unknown)} of {labels.size} labels",
                 advice=advice,
             )
+
+
+_FOUND = {
+    "option": "given",
+    "file": "named in the files",
+    "format": "of the format",
+    "ids": "found by the ids",
+    "assumed": "assumed: no file names one",
+}
+
+
+@dataclass(frozen=True, order=True)
+class TableUse:
+    """A class table by which labels were read, and what named it.
+
+    Attributes:
+        table: name of the table.
+        found: "option" (`source_classes`), "file" (the metadata of the data), "format" (the files
+            of a benchmark), "ids" (found by the ids of the labels), or "assumed".
+    """
+
+    table: str
+    found: str
+
+    def __str__(self) -> str:
+        return f"{self.table} ({_FOUND[self.found]})"
 
 
 BUILT_IN: dict[str, ClassTable] = {}

@@ -36,7 +36,6 @@ from .results import Evaluation as Evaluation
 from .results import FigureTable as FigureTable
 from .results import FrameScore as FrameScore
 from .results import Interval as Interval
-from .results import TableUse as TableUse
 from .results import bootstrap as bootstrap
 from .results import compare as compare
 from .results import geometric_table as geometric_table

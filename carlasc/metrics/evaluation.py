@@ -14,7 +14,7 @@ from functools import cache, partial
 import numpy as np
 
 from carlasc.core.arrays import BoolArray, LabelArray
-from carlasc.core.classes import ClassTable, Remap, times
+from carlasc.core.classes import ClassTable, Remap, TableUse, times
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA
@@ -33,7 +33,7 @@ from carlasc.metrics.regions import (
     motion,
     visibility,
 )
-from carlasc.metrics.results import Evaluation, FrameScore, TableUse
+from carlasc.metrics.results import Evaluation, FrameScore
 from carlasc.metrics.scoring import Scoring
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
@@ -145,7 +145,8 @@ class Scorer:
             self.breakdown.compute(),
             None if self.rays is None else self.rays.compute(),
             None if self.actors is None else self.actors.compute(),
-            *(tuple(sorted(uses)) for uses in self.uses),
+            tuple(sorted(self.uses[0])),
+            tuple(sorted(self.uses[1])),
             {side: dict(sorted(ids.items())) for side, ids in self.unknown.items() if ids},
         )
 
@@ -234,8 +235,10 @@ class Scorer:
             region = self.scoring.region(spec).reshape(truth.shape)
         try:
             if self.scoring.allow_unknown:
-                for side, labels, table in zip(self.unknown, content, tables, strict=False):
-                    self.unknown[side].update(self.convention.unknown_ids(labels, table))
+                for name, labels, table in zip(
+                    self.unknown, (prediction, truth), tables, strict=True
+                ):
+                    self.unknown[name].update(self.convention.unknown_ids(labels, table))
             pred, true, counted = self.convention.prepare(
                 (prediction, tables[0]),
                 (truth, tables[1]),

@@ -20,7 +20,7 @@ class SequenceGrid(GridFrames):
         self.sequence, self.grid = sequence, grid
         self.path, self.location = sequence.path, f"{sequence.location}/{grid}"
         self.spec, self.classes = sequence.grids[grid], sequence.classes_of(grid)
-        self.named = "file" if sequence.names_classes(grid) else "assumed"
+        self.named = sequence.table_use(grid).found
         has_poses = layout.POSES in sequence.documents()
         self.origin = (0.0, 0.0, 0.0) if has_poses else None
 

@@ -81,8 +81,9 @@ def pair_grids(
         if not found:
             expected = f"sequences {', '.join(sequences)}"
             raise MissingDataError(str(side), expected=expected, found="none of them")
+    alone: list[GridFrames] = []
     if len(predictions) == len(truths) == 1:
-        pairs, alone = [Pair(predictions[0], next(iter(truths.values())))], []
+        pairs = [Pair(predictions[0], next(iter(truths.values())))]
     else:
         pairs, alone = _match(predictions, truths)
     notes = []

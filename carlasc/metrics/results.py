@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from carlasc.core.arrays import IntArray
-from carlasc.core.classes import ClassTable
+from carlasc.core.classes import ClassTable, TableUse
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics.actor_scores import ActorScore
 from carlasc.metrics.confusion import ConfusionMatrix, json_number
@@ -101,32 +101,6 @@ class FrameScore:
     sequence: str
     frame: str
     score: ConventionScore
-
-
-_FOUND = {
-    "option": "given",
-    "file": "named in the files",
-    "format": "of the format",
-    "ids": "found by the ids",
-    "assumed": "assumed: no file names one",
-}
-
-
-@dataclass(frozen=True, order=True)
-class TableUse:
-    """A class table by which labels were read, and what named it.
-
-    Attributes:
-        table: name of the table.
-        found: "option" (`source_classes`), "file" (the metadata of the data), "format" (the files
-            of a benchmark), "ids" (found by the ids of the labels), or "assumed".
-    """
-
-    table: str
-    found: str
-
-    def __str__(self) -> str:
-        return f"{self.table} ({_FOUND[self.found]})"
 
 
 @dataclass(frozen=True)

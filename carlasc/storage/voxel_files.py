@@ -6,6 +6,7 @@ A format is an entry point of the group `carlasc.voxels`, whose value is a `Voxe
 
 from __future__ import annotations
 
+import copy
 import fnmatch
 import os
 import re
@@ -19,7 +20,7 @@ from typing import Literal
 import numpy as np
 
 from carlasc.core.arrays import AnyArray, BoolArray, FloatArray, IntArray, LabelArray
-from carlasc.core.classes import ClassTable, times
+from carlasc.core.classes import ClassTable, TableUse, times
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLASC11, table_to_json
 from carlasc.errors import FormatError, MissingDataError, load_plugin, plugin_names
@@ -31,7 +32,6 @@ from carlasc.storage.protocol import Sequence, Source
 SeenBy = Literal["lidar", "camera"]
 """Whose mask of observed voxels is taken, for data that have both."""
 
-Named = Literal["file", "format", "assumed"]
 _Read = Callable[[Path], LabelArray]
 GROUP = "carlasc.voxels"
 IGNORED_ID = 255  # in files of other programs: a voxel that does not count
@@ -57,7 +57,7 @@ class GridFrames(ABC):
     location: str
     spec: GridSpec | None
     classes: ClassTable | None
-    named: Named = "assumed"
+    named: str = "assumed"
     benchmark: str | None = None
     origin: tuple[float, float, float] | None = None
 
@@ -127,7 +127,7 @@ class VoxelFormat:
     mask: Callable[[Path, SeenBy], BoolArray | None] | None = None
     holds: Callable[[Path], bool] | None = None
     label_bytes: int = 2
-    named: Named = "format"
+    named: str = "format"
     benchmark: tuple[str, ...] = ()
     place: str = "the sensor, x forward"
     origin: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
@@ -389,6 +389,13 @@ class VoxelSequence(Sequence):
         self.path, self.location, self.frames_of = path, first.location, frames_of
         self.name = path.rpartition("/")[2] or Path(first.location).name
 
+    def with_classes(self, classes: ClassTable) -> VoxelSequence:
+        """Return the same files, read with another class table."""
+        frames_of = {name: copy.copy(frames) for name, frames in self.frames_of.items()}
+        for frames in frames_of.values():
+            frames.classes, frames.named = classes, "option"
+        return VoxelSequence(self.path, frames_of)
+
     @cached_property
     def metadata(self) -> Metadata:
         """The axes and classes of the format."""
@@ -472,6 +479,11 @@ class VoxelSequence(Sequence):
         table = self._table(grid)
         record = {"format": layout.FORMAT, "classes": table_to_json(table)}
         return to_json(self._spec(grid).to_params(table.num_channels) | {"carlasc": record})
+
+    def table_use(self, grid: str = "") -> TableUse:
+        """Return the class table of a grid, which the format names."""
+        frames = self.frames_of[grid or next(iter(self.frames_of))]
+        return TableUse((frames.classes or CARLASC11).name, frames.named)
 
     def _table(self, name: str) -> ClassTable:
         return (self.frames_of[name].classes or CARLASC11).with_free_first
