@@ -18,6 +18,7 @@ from carlasc.storage.protocol import FrameArrays, Sequence, SequenceWriter, Sink
 from carlasc.storage.published import PublishedSequence, PublishedSource
 from carlasc.storage.transport.remote_tree import target_of
 from carlasc.storage.transport.trees import LocalTarget, LocalTree, Target
+from carlasc.storage.voxel_files import find_voxels
 
 # end record of a zip without a comment, as NumPy writes it
 _ZIP_END, _ZIP_END_BYTES = (
@@ -49,10 +50,23 @@ class FolderSource(PublishedSource):
     def sequences(self) -> Mapping[str, Sequence]:
         """Return the sequences found up to four levels down, by path.
 
+        A folder without any may hold voxel grids of another program, which are then presented in
+        the layout.
+
         Raises:
             MissingDataError: no sequence was found; the message says what was expected.
         """
-        return {path: FolderSequence(self.folder, path) for path in super().sequences()}
+        sequences: dict[str, Sequence] = {}
+        try:
+            sequences = {path: FolderSequence(self.folder, path) for path in super().sequences()}
+        except MissingDataError:
+            if (found := find_voxels(self.folder)) is None:
+                raise
+            return found.sequences()
+        # folders of other programs may have names of the layout, such as predictions/
+        is_other = not any(sequence.fields() for sequence in sequences.values())
+        voxels = find_voxels(self.folder) if is_other else None
+        return sequences if voxels is None else voxels.sequences()
 
 
 class FolderSequence(PublishedSequence):

@@ -20,7 +20,7 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, IntArray, LabelArray
 from carlasc.core.boxes import Boxes
-from carlasc.core.classes import ClassTable
+from carlasc.core.classes import ClassTable, TableUse
 from carlasc.core.frames import check_seconds
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import Coordinates, Grid, GridSpec
@@ -208,6 +208,18 @@ class Sequence(ABC):
         if table is None:
             return self.metadata.classes
         return table_from_json(table, f"{self.location}/{layout.params_file(grid)}")
+
+    def table_use(self, grid: str = "") -> TableUse:
+        """Return the class table of the points or of a grid, and whether carlasc.json or the
+        params.json of the grid names it; otherwise that of CARLA is assumed, as published files
+        have it.
+        """
+        name, table = layout.METADATA, self.classes_of(grid) if grid else self.metadata.classes
+        named = bool(grid) and self._record(grid).get("classes") is not None
+        if not named and name in self.documents():
+            values = parse_json(self.read_document(name), f"{self.location}/{name}")
+            named = "classes" in values
+        return TableUse(table.name, "file" if named else "assumed")
 
     def predicted_by(self, grid: str) -> str | None:
         """Return the name of the network that predicted a grid, from its params.json; None if the
