@@ -22,7 +22,14 @@ from carlasc.converting.exporter import (
 from carlasc.converting.protocol import Failure, check_outside
 from carlasc.converting.registry import load_exporter, read_options
 from carlasc.core.arrays import AnyArray
-from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError, StorageError
+from carlasc.errors import (
+    CarlascError,
+    ConflictError,
+    FormatError,
+    MissingDataError,
+    StorageError,
+    check_types,
+)
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Part, Run, StepCounter
 from carlasc.storage.files import (
@@ -104,6 +111,7 @@ def export(
             other options.
         StorageError: the output cannot be written. The files written so far are complete.
     """
+    check_types(export, locals())
     start = time.perf_counter()
     kind = load_exporter(name)
     exporter = kind(**read_options(kind, options))
