@@ -30,6 +30,7 @@ from carlasc.errors import (
     MissingDataError,
     StorageError,
     check_choice,
+    check_types,
 )
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Part, Run, StepCounter
@@ -127,6 +128,7 @@ def export(
             other options.
         StorageError: the output cannot be written. The files written so far are complete.
     """
+    check_types(export, locals())
     start = time.perf_counter()
     check_choice("compare_inputs", compare_inputs, CompareInputs)
     kind = load_exporter(name)

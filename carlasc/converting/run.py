@@ -23,7 +23,7 @@ from carlasc.converting.stages import Conversion
 from carlasc.core.choices import CompareInputs
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError, MissingDataError, check_choice
+from carlasc.errors import ArgumentError, MissingDataError, check_choice, check_types
 from carlasc.groundtruth.options import FromScans, GridOptions, Voting, fit_to_ground
 from carlasc.groundtruth.run import regrid
 from carlasc.inspection.findings import Finding
@@ -130,6 +130,7 @@ def convert(
         ConflictError: `out` lies inside `source`, or holds other data.
         StorageError: the output cannot be written. The files written so far are complete.
     """
+    check_types(convert, locals())
     start = time.perf_counter()
     root = Path(source)
     converter = open_converter(name, root, options)

@@ -33,6 +33,7 @@ from carlasc.errors import (
     MissingDataError,
     StorageError,
     check_choice,
+    check_types,
     reading,
 )
 from carlasc.groundtruth.comparing import InputCheck
@@ -93,7 +94,7 @@ class RegridResult:
 
 def regrid(
     source: AnyPath | Source | Capture,
-    spec: GridSpec,
+    spec: GridSpec | str | float,
     out: AnyPath | Sink | None = None,
     *,
     observe: Observe | None = None,
@@ -117,7 +118,7 @@ def regrid(
         source: a sequence's folder, a folder of several sequences, or, unless it holds captures,
             anything that `carlasc.open` takes; or a `carlasc.captures.Capture`, such as a
             `SimulatedCapture`, which is on no disk.
-        spec: geometry of the grid.
+        spec: geometry of the grid, or what `GridSpec.of` takes: "coarse", or 0.2 (metres).
         out: where to write: a folder or a `.zarr` store, on this machine or in an object store; or
             any Sink. Each sequence is written to its path below `source`, then `<coordinates>/`.
             None writes into `source`.
@@ -146,6 +147,8 @@ def regrid(
         StorageError: the disk is full or the output cannot be written to. Files that were written
             are complete.
     """
+    check_types(regrid, locals())
+    spec = GridSpec.of(spec)
     start = time.perf_counter()
     run.part.refuse(overwrite)
     check_choice("compare_inputs", compare_inputs, CompareInputs)

@@ -16,7 +16,7 @@ import numpy as np
 from carlasc.captures.raw import Capture, find_captures
 from carlasc.core.arrays import IntArray
 from carlasc.core.notebook import data_frame
-from carlasc.errors import CarlascError, MissingDataError, without_credentials
+from carlasc.errors import CarlascError, MissingDataError, check_types, without_credentials
 from carlasc.inspection.staleness import changed_inputs
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath
@@ -171,6 +171,7 @@ def info(source: AnyPath | Source) -> Overview:
     Raises:
         MissingDataError: the source holds neither a sequence nor a capture.
     """
+    check_types(info, locals())
     captures: dict[str, Capture] = {}
     if not isinstance(source, Source):
         with suppress(MissingDataError):

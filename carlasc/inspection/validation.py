@@ -14,7 +14,7 @@ import numpy as np
 from carlasc.core.arrays import Float32Array, FloatArray, LabelArray
 from carlasc.core.geometry import check_rigid
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError, CarlascError
+from carlasc.errors import ArgumentError, CarlascError, check_types
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.reporting import Report, short
@@ -147,6 +147,7 @@ def validate(
         ArgumentError: `every` is less than 1.
         MissingDataError: there is no data set.
     """
+    check_types(validate, locals())
     if every is not None and every < 1:
         raise ArgumentError("every", expected="1 or more", found=str(every))
     opened = as_source(source)

@@ -11,7 +11,7 @@ import numpy as np
 
 from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.geometry import invert, multiply
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, check_types
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.motion_pass import (
     pose_notes,
@@ -101,6 +101,7 @@ def refine(
         DependencyError: poses have to be estimated, and kiss-icp is not installed.
         StorageError: the files cannot be written.
     """
+    check_types(refine, locals())
     began = time.perf_counter()
     if poses.refine == "never":
         raise ArgumentError("refine", expected="auto or always", found="'never'")

@@ -19,7 +19,7 @@ import numpy as np
 
 from carlasc.core.arrays import Uint8Array
 from carlasc.core.frames import Frames
-from carlasc.errors import ArgumentError, CarlascError, reading
+from carlasc.errors import ArgumentError, CarlascError, check_types, reading
 from carlasc.groundtruth import FromScans
 from carlasc.groundtruth.from_scans.feed import ScanFeed, WithoutScans
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
@@ -155,6 +155,7 @@ def audit(
         MissingDataError: there are no grids, no scans, or none that belong together.
         FormatError: the geometry of the grids is not known.
     """
+    check_types(audit, locals())
     start = time.perf_counter()
     if made_from is not None and not made_from[0] <= 0 <= made_from[1]:
         raise ArgumentError(

@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 from filelock import FileLock, Timeout
 
-from carlasc.errors import ArgumentError, MissingDataError, StorageError
+from carlasc.errors import ArgumentError, MissingDataError, StorageError, check_types
 from carlasc.storage.files import AnyPath, sync_file, write_at
 from carlasc.storage.transport.remote_tree import RemoteTree
 from carlasc.storage.transport.trees import LocalTree, Tree
@@ -55,6 +55,7 @@ class Cache:
     max_bytes: int = 64 << 30
 
     def __post_init__(self) -> None:
+        check_types(Cache, vars(self))
         if self.max_bytes <= 0:
             raise ArgumentError(
                 "max_bytes", expected="a number of bytes above 0", found=str(self.max_bytes)
