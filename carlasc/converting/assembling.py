@@ -30,6 +30,7 @@ from carlasc.errors import (
     CarlascError,
     FormatError,
     check_choice,
+    check_types,
     describe,
     first_names,
 )
@@ -71,6 +72,7 @@ class LayoutOptions:
     level: bool = False
 
     def __post_init__(self) -> None:
+        check_types(LayoutOptions, vars(self))
         check_choice("axes", self.axes, Axes)
         check_choice("images", self.images, Images)
         check_choice("flow", self.flow, FlowSource)

@@ -85,6 +85,8 @@ class RecordingPlan:
         missing: numbers of the frames whose scan is not written yet.
         unfinished: numbers of the frames without a scan, or without the fields from the motion of
             actors.
+        again: whether all frames are made again and compared with those in the output, because the
+            data set changed.
     """
 
     recording: Recording
@@ -101,6 +103,12 @@ class RecordingPlan:
     force: bool = False
     missing: set[int] = field(default_factory=set)
     unfinished: set[int] = field(default_factory=set)
+    again: bool = False
+
+    def make_again(self) -> None:
+        """Make all frames again, because the data set changed."""
+        numbers = {handle.number for handle in self.recording.frames}
+        self.again, self.missing, self.unfinished = True, numbers, set(numbers)
 
     def take_estimate(self, first_T_scan: FloatArray) -> None:
         """Take estimated poses, (F, 4, 4) by frame number."""
@@ -559,14 +567,18 @@ def begin(plan: RecordingPlan, target: AxesAndClasses, metadata: Metadata) -> No
             advice="give the same `level`, or write to another place",
         )
     _announce(plan)
-    documents = {layout.METADATA: agree_metadata(writer, replace(metadata, extra=extra))}
+    described = replace(metadata, extra=extra)
+    documents = {layout.METADATA: agree_metadata(writer, described)}
+    if plan.again and existing is not None:
+        documents[layout.METADATA] = described.to_json()
     documents[layout.TIMES] = agree_lines(writer, layout.TIMES, plan.times - plan.times[0])
     if plan.voxels is not None:
         documents[layout.params_file(layout.grid_folder(plan.voxels))] = to_json(
             _voxel_params(plan.voxels, target)
         )
     _write(plan, documents)
-    estimated = writer.read_document(layout.POSES) if plan.poses is None else None
+    is_known = plan.poses is None and not plan.again
+    estimated = writer.read_document(layout.POSES) if is_known else None
     if estimated is not None:
         stored = layout.decode_poses(estimated, f"{writer.location}/{layout.POSES}")
         plan.take_estimate(mirror_poses(stored) if target.mirrored else stored)
@@ -582,7 +594,10 @@ def write_poses(plan: RecordingPlan, target: AxesAndClasses) -> None:
     """
     assert plan.poses is not None
     poses = mirror_poses(plan.poses) if target.mirrored else plan.poses
-    _write(plan, {layout.POSES: agree_lines(plan.writer, layout.POSES, poses)})
+    if plan.again and plan.pose_source == KISS_ICP:
+        _write(plan, {layout.POSES: layout.encode_poses(poses)})
+    else:
+        _write(plan, {layout.POSES: agree_lines(plan.writer, layout.POSES, poses)})
 
 
 def _places(extra: Mapping[str, Any]) -> list[object]:
