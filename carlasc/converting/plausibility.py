@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from carlasc.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray
-from carlasc.core.geometry import Transform, axes_named, thin
+from carlasc.core.geometry import DIRECTIONS, Transform, thin
 from carlasc.errors import FormatError
 from carlasc.inspection.findings import Finding, Severity
 from carlasc.motion.ground import ground_plane
@@ -140,7 +140,8 @@ def _mount(
     scans: Sequence[AnyFloatArray], up: str, axes: str, steepest: float, *, certain: bool
 ) -> Mount | None:
     """Return the mount of a sensor with these axes; None if most scans show no ground then."""
-    turn = axes_named(axes)
+    turn = np.eye(4)
+    turn[:3, :3] = np.transpose([DIRECTIONS[letter] for letter in axes])
     grounds = [
         ground
         for points in scans

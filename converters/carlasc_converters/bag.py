@@ -183,7 +183,8 @@ class BagRecording(Recording):
             return None
         first, last = np.searchsorted(motion[0], [stamp - _AROUND_NS, stamp + _AROUND_NS])
         near = slice(max(int(first) - 1, 0), int(last) + 1)
-        return Trajectory(motion[1][near], (motion[0][near] - stamp) * 1e-9, self.location)
+        seconds = np.asarray((motion[0][near] - stamp) * 1e-9, np.float64)
+        return Trajectory(motion[1][near], seconds, self.location)
 
     def times(self) -> FloatArray:
         """Return seconds after the first frame."""

@@ -15,11 +15,11 @@ import numpy as np
 
 from carlasc.converting import Converter, FrameHandle, Recording, Sensor, Trajectory
 from carlasc.core.arrays import AnyArray, FloatArray, IntArray
-from carlasc.core.geometry import Transform, axes_named, invert, slerp
+from carlasc.core.geometry import Transform, invert, slerp
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.motion.ground import find_ground
-from carlasc_converters.calibration_file import in_axes, read_calibration
+from carlasc_converters.calibration_file import axes_named, in_axes, read_calibration
 from carlasc_converters.files import raw_advice, sequence_name
 from carlasc_converters.given_classes import classes_given
 from carlasc_converters.pcd import PcdHeader, read_header

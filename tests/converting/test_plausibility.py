@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from carlasc_converters.calibration_file import axes_named
 from helpers.converters.drive_converter import DriveConverter
 from helpers.errors import raises
 from typer.testing import CliRunner
@@ -22,7 +23,7 @@ from carlasc.converting.plausibility import (
     find_mount,
 )
 from carlasc.core import translation
-from carlasc.core.geometry import axes_named, invert, transform_points
+from carlasc.core.geometry import invert, transform_points
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.motion import PoseOptions
 from carlasc.running import Run
