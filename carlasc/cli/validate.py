@@ -74,7 +74,7 @@ def validate(
 ) -> None:
     """Check a data set: files, poses, times, and whether scans agree with poses and grids.
 
-    The exit code is 1 if there is an error.
+    The exit code is 0 if the data are sound, and 1 otherwise.
 
     It finds files of the wrong size, labels without votes, unknown classes, poses that are not
     rigid or jump, and gaps. By comparing scans with poses and grids, it recognizes a mirrored y
@@ -121,7 +121,7 @@ def validate(
 
 def print_result(result: ValidationResult, *, everything: bool = False) -> None:
     """Print the findings by kind, errors first; `carlasc demo` uses it too."""
-    from carlasc.inspection.findings import SEVERITIES
+    from carlasc.inspection.findings import SEVERITIES, STATES
 
     for (severity, check), findings in result.grouped().items():
         show(f"{severity}: {check} ({len(findings)})", _COLORS[severity])
@@ -153,8 +153,11 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
             show(f"  sensor in the frame of the poses: {mounting}")
         for camera, agreement in report.images.items():
             show(f"  images of {camera} on the scans: {agreement}")
+        for state, words in STATES.items():
+            if own := [check for check, of_check in report.checks.items() if of_check == state]:
+                show(f"  {words}: {', '.join(own)}")
     counts = ", ".join(count(result.count(severity), severity) for severity in SEVERITIES)
-    show(f"{result.location}: {'sound' if result.ok else 'not sound'} ({counts})", "bold")
+    show(f"{result.location}: {result.verdict} ({counts})", "bold")
 
 
 def print_held_out(result: HoldoutResult) -> None:

@@ -3,8 +3,8 @@ estimated from motions.
 
 In turns, poses of an IMU, a camera or the rear axle move differently from those of the sensor. Late
 poses differ while the speed or the turn rate changes. One constant transform and one constant delay
-are fitted to the motions of the aligned scans (`joint_alignment`) by least squares, with a standard
-error for each number. It is large for what a drive does not determine: the height of the sensor on
+are fitted to the motions of the aligned scans (`joint_alignment`) by least squares, with an
+interval for each number. It is large for what a drive does not determine: the height of the sensor on
 a flat road, and its whole position on a straight road.
 """
 
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from carlasc.core.arrays import BoolArray, FloatArray
+from carlasc.core.arrays import BoolArray, FloatArray, IntArray
 from carlasc.core.geometry import Transform, invert, multiply, rotations_of, slerp, small_motions
 from carlasc.motion.solving import solve_positive
 
@@ -32,7 +32,9 @@ _DETERMINED = np.array([0.2, 0.2, 0.2, *np.deg2rad([1.0, 1.0, 1.0]), 0.03])
 # smaller values need no correction
 # fact: relevant-mounting
 _RELEVANT = np.array([0.15, 0.15, 0.15, *np.deg2rad([0.5, 0.5, 0.5]), 0.02])
-_CERTAIN = 4.0  # values of fewer standard errors need none either
+_CERTAIN = 2.0  # values within so many times their error need none either
+_GROUP = 15  # scans whose errors are similar
+_EXPLAINED = 1.0  # least variance that a value explains, in variances of what remains
 _LIMITS = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5, 2.0])  # greatest values
 _NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "late")
 
@@ -45,7 +47,9 @@ class Mounting:
         values: (7,) x, y, z of the sensor in metres, its rotation vector in radians, and the delay
             of the poses in seconds: a scan has the pose that the file gives for a later time. Exact
             poses of the sensor have zeros.
-        errors: (7,) standard errors, infinite where a value is not determined.
+        errors: (7,) half the widths of intervals that hold the true value in 95 % of the cases
+            (docs/studies/poses.md), infinite where a value is not determined, or where drift,
+            jitter or distortion of the poses explain as much.
     """
 
     values: FloatArray
@@ -119,7 +123,19 @@ def find_mounting(
         step = solve_positive(information.copy(), right)
         values = np.clip(values + step, -_LIMITS, _LIMITS)
     inverse = np.stack([solve_positive(information.copy(), row) for row in np.eye(7)])
-    return Mounting(values, np.sqrt(_SAME * np.diag(inverse)))
+    # Drift and distortion make errors that motions within some seconds share, so their sums vary
+    # more than those of independent ones. Few sums need a wider interval (Student's t).
+    pulls = (weights[:, :, None] * slope * scaled[:, :, None]).sum(axis=1)
+    shared = np.concatenate([part.groups + 1j * row for row, part in enumerate(parts)])
+    sums = np.stack([pulls[shared == group].sum(axis=0) for group in np.unique(shared)])
+    more = max(len(sums) - 1, 1)
+    spread = inverse @ (sums.T @ sums) @ inverse * (more + 1) / more
+    apart = (2.0 + 3.0 / more + 3.0 / more**2) * np.sqrt(np.diag(spread))
+    errors = np.maximum(2.0 * np.sqrt(_SAME * np.diag(inverse)), apart)
+    # A value that moves the sensor by less than what remains unexplained is not named.
+    explained = np.square(slope * values).mean(axis=0).max(axis=0)
+    unsure = (explained < _EXPLAINED) & (np.abs(values) > errors)
+    return Mounting(values, np.where(unsure, np.inf, errors))
 
 
 @dataclass(frozen=True)
@@ -131,12 +147,14 @@ class _Motions:
         aligned: (K, 4, 4) aligned poses.
         seconds: (K,) times of these scans.
         at: (P, 2) times of the start and the end of each motion.
+        groups: (P,) number of the part of the run that each motion is in.
     """
 
     given: FloatArray
     aligned: FloatArray
     seconds: FloatArray
     at: FloatArray
+    groups: IntArray
 
     @classmethod
     def of(
@@ -156,7 +174,8 @@ class _Motions:
             or [np.empty((0, 2), np.int64)]
         )
         given, own = poses[first + rows], seconds[first : first + len(aligned)]
-        return cls(multiply(invert(given[:, 0]), given[:, 1]), aligned, own, own[rows])
+        motions = multiply(invert(given[:, 0]), given[:, 1])
+        return cls(motions, aligned, own, own[rows], rows.sum(axis=1) // (2 * _GROUP))
 
 
 def _residuals(parts: Sequence[_Motions], values: FloatArray) -> FloatArray:
