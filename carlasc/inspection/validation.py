@@ -15,10 +15,10 @@ import numpy as np
 from carlasc.core.arrays import Float32Array, LabelArray
 from carlasc.core.geometry import check_rigid
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError, CarlascError
+from carlasc.errors import ArgumentError, CarlascError, check_types
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.options import FromScans
-from carlasc.groundtruth.reporting import Report, digest_of, short
+from carlasc.groundtruth.reporting import Report, short
 from carlasc.inspection.agreement import GridDiagnosis, GridEvidence, GroundBelow, check_actors
 from carlasc.inspection.alignment import (
     REACH_M,
@@ -52,12 +52,14 @@ from carlasc.inspection.soundness import (
     recorded,
     untested,
 )
+from carlasc.inspection.staleness import check_inputs
 from carlasc.motion.ground import ground_of
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath
 from carlasc.storage.folder import FolderSequence
+from carlasc.storage.inputs import digest_of
 from carlasc.storage.protocol import Sequence, Source
 
 _ADVICE = (
@@ -171,6 +173,7 @@ def validate(
             are not in a folder, so that they cannot say what was accepted.
         MissingDataError: there is no data set.
     """
+    check_types(validate, locals())
     if every is not None and every < 1:
         raise ArgumentError("every", expected="1 or more", found=str(every))
     opened = as_source(source)
@@ -254,6 +257,7 @@ def _examine(plan: _CheckedFrames, step: Callable[[], None] = lambda: None) -> _
         if "points" in sequence.fields():
             made += [RANGE, GROUND] if sequence.metadata.has_rays else [RANGE]
             findings.extend(facts.findings(sequence))
+        findings.extend(check_inputs(sequence))
     shares = {}
     for name, grid in evidence.items():
         diagnosis = grid.diagnose()
