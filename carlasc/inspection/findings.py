@@ -89,7 +89,7 @@ class SequenceReport:
             poses, metres; None if it is undetermined.
         refined_m: the same distance under refined poses.
         mounting: x, y, z, roll, pitch and yaw of the sensor in the frame of the poses, and the
-            delay of the poses, each with its standard error, or "undetermined"; empty if none could
+            delay of the poses, each with its interval, or "undetermined"; empty if none could
             be measured.
         images: by camera, the shift of its images against the scans, in pixels, and their delay, or
             "undetermined"; empty without images.

@@ -1,5 +1,5 @@
-"""Whether what is said of a mounting is right: `python docs/studies/diagnoses.py` prints the table of
-docs/studies/poses.md.
+"""Whether what is said of a mounting is right: `python docs/studies/diagnoses.py` prints the table
+of docs/studies/poses.md.
 
 Drives of the simulated town and winding ones get a mounting (none, a lever arm, a rotation, a
 delay), and errors of odometry. The aligned poses, from which a mounting is found, have errors of a
@@ -168,9 +168,7 @@ def main() -> None:
         print(f"| all | | {all_claimed} | {all_right / max(all_claimed, 1):.1%} | |")
 
 
-def _with_mounting(
-    sensor: Poses, values: NDArray[np.float64], name: str, seed: int
-) -> Poses:
+def _with_mounting(sensor: Poses, values: NDArray[np.float64], name: str, seed: int) -> Poses:
     """Return poses of another point of the vehicle, at other times, with errors."""
     mount = _turn(*values[3:6])
     mount[:3, 3] = values[:3]
