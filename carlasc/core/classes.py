@@ -15,7 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from carlasc.core.arrays import AnyIntArray, FloatArray, Int32Array, LabelArray, Uint8Array
-from carlasc.errors import ArgumentError, FormatError, first_names
+from carlasc.errors import ArgumentError, FormatError, check_types, first_names
 
 Color = tuple[int, int, int]
 ROLES = ("moving", "movable", "deformable", "ground")
@@ -63,6 +63,7 @@ class ClassTable:
     free: int = 0
 
     def __post_init__(self) -> None:
+        check_types(ClassTable, vars(self))
         where = f"class table {self.name}"
         ids = set(self.names)
         if not ids or min(ids) < 0 or max(ids) > _MAX_ID:
@@ -323,6 +324,7 @@ class Remap:
     mapping: Mapping[int, int]
 
     def __post_init__(self) -> None:
+        check_types(Remap, vars(self))
         object.__setattr__(self, "mapping", dict(self.mapping))
         for old, new in self.mapping.items():
             if old < 0 or new not in self.target.names:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Integral
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,14 +50,16 @@ class LabelMap:
         self._table = (self._remap or kept).table
 
     def __call__(self, labels: LabelArray, where: str) -> LabelArray:
-        """Map labels of any shape to the target table, in its dtype.
+        """Map labels of any shape to the target table, as uint8, or int32 if ids exceed 255.
 
         Raises:
             FormatError: an id is not in the source table. `where` is the file named in the message.
         """
         from carlasc.dataset.stacking import look_up
 
-        mapped = look_up(labels, self._table, self.target.dtype)
+        # torch cannot compute with uint16
+        dtype = np.dtype(np.int32) if self.target.dtype.itemsize > 1 else self.target.dtype
+        mapped = look_up(labels, self._table, dtype)
         if mapped is None and self._remap is not None:
             return self._remap(labels, where)  # raises an error with the id
         if mapped is None:
@@ -71,6 +74,8 @@ def _as_remap(remap: str | Remap | Mapping[int, int] | ArrayLike, classes: Class
     if isinstance(remap, str):
         return read_remap(remap)
     if isinstance(remap, Mapping):
+        if wrong := [f"{a!r}: {b!r}" for a, b in remap.items() if not _are_ids(a, b)]:
+            raise ArgumentError("remap", expected="whole numbers as ids", found=wrong[0])
         mapping = {int(old): int(new) for old, new in remap.items()}
     else:
         table = np.asarray(remap)
@@ -86,6 +91,10 @@ def _as_remap(remap: str | Remap | Mapping[int, int] | ArrayLike, classes: Class
     ids = sorted(set(mapping.values()))
     target = ClassTable("custom", {i: f"class {i}" for i in ids}, dict.fromkeys(ids, _GREY))
     return Remap("custom", classes, target, mapping)
+
+
+def _are_ids(*values: object) -> bool:
+    return all(isinstance(value, Integral) for value in values)
 
 
 _PARTS = {  # field of a sample -> fields of the grid
@@ -106,7 +115,7 @@ OF_GRID = frozenset(_PARTS)
 _PLAIN: dict[str, type[np.generic]] = {
     "occupied": np.float32,
     "flags": np.uint8,
-    "views": np.uint16,
+    "views": np.int32,
     "instances": np.int64,
     "camera_visible": np.uint8,
 }

@@ -15,7 +15,7 @@ from carlasc.core.arrays import IntArray
 from carlasc.core.classes import ClassTable, Remap, TableUse, class_weights
 from carlasc.core.notebook import data_frame
 from carlasc.core.tables import benchmark_remap, remaps_between, to_table
-from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
+from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError, check_types
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
@@ -220,6 +220,7 @@ def stats(
         FormatError: the sequences have different class tables, or the remap is of another table.
         MissingDataError: there is no data set, or it has no labels.
     """
+    check_types(stats, locals())
     if every < 1:
         raise ArgumentError("every", expected="1 or more", found=str(every))
     opened = as_source(source)

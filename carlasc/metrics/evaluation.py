@@ -18,7 +18,7 @@ from carlasc.core.classes import ClassTable, Remap, TableUse, times
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA
-from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
+from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError, check_types
 from carlasc.metrics.actor_scores import ActorScores
 from carlasc.metrics.confusion import ConfusionMatrix
 from carlasc.metrics.conventions import CONVENTIONS, Convention, convention_named, own_convention
@@ -413,6 +413,7 @@ def evaluate(
         MissingDataError: no grid exists, a sequence has no ground truth, or no frame can be scored.
         FormatError: the grids or classes of prediction and ground truth cannot be compared.
     """
+    check_types(evaluate, locals())
     pairs, notes = pair_grids(source, truth, grid, truth_grid, sequences)
     return score_pairs(
         pairs, convention, source_classes, scoring, frames, name or _name_of(source), run, notes

@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 from carlasc.core.arrays import BoolArray
 from carlasc.core.choices import Voxels as Voxels  # noqa: PLC0414 (part of this module)
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError, check_choice
+from carlasc.errors import ArgumentError, check_choice, check_types
 
 Region = Callable[[GridSpec], BoolArray]
 BREAKDOWNS = ("distance", "height", "visibility", "motion", "seen")
@@ -47,6 +47,7 @@ class Scoring:
     allow_unknown: bool = False
 
     def __post_init__(self) -> None:
+        check_types(Scoring, vars(self))
         check_choice("voxels", self.voxels, Voxels)
         for name in self.by:
             check_choice("by", name, BREAKDOWNS)

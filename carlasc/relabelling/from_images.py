@@ -31,7 +31,7 @@ from carlasc.core.arrays import (
 from carlasc.core.cameras import CameraModel
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError, MissingDataError, check_types
 from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
 from carlasc.groundtruth.options import FromScans, Voting
@@ -133,6 +133,7 @@ def label_images(
             are not valid.
         StorageError: the files cannot be written.
     """
+    check_types(label_images, locals())
     began = time.perf_counter()
     root = None if pixels is None else Path(pixels)
     by = by if by is not None else "images" if root is None else root.resolve().name

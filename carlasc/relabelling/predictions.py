@@ -26,7 +26,7 @@ from carlasc.core.arrays import (
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.tables import remaps_between, to_table
-from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_types
 from carlasc.relabelling.copies import (
     PREDICTED_FIELDS,
     LabelResult,
@@ -99,6 +99,7 @@ def label(
         FormatError: a file of predictions does not fit its scan or its class table.
         StorageError: the files cannot be written.
     """
+    check_types(label, locals())
     began = time.perf_counter()
     source, root = as_source(source), Path(predictions)
     by = root.resolve().name if by is None else by

@@ -6,7 +6,7 @@ The writer supports object stores too.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -230,6 +230,11 @@ class FolderWriter(SequenceWriter):
         self.target.remove_many(f"{grid}/{name}" for name in names)
         self.target.remove(layout.params_file(grid))
         self._cells.pop(grid, None)
+
+    def remove_frames(self, fields: Iterable[str], frames: Collection[int]) -> None:
+        """Remove files of some frames."""
+        entries = [layout.field_named(field) for field in fields]
+        self.target.remove_many(entry.file(frame) for entry in entries for frame in frames)
 
     def write_document(self, name: str, data: bytes) -> None:
         """Write a text file."""

@@ -6,7 +6,7 @@ import os
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_types
 from carlasc.running.spreading import Part
 from carlasc.storage.files import AnyPath, damaged, unfinished
 from carlasc.storage.folder import FolderSink, FolderSource
@@ -60,6 +60,7 @@ def open(
         DependencyError: a package is missing; the message names the extra of carlasc that installs
             it.
     """
+    check_types(open, locals())
     text = os.fspath(path)
     if is_url(text):
         return _open_remote(RemoteTree(text, storage_options), cache)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import math
 from abc import ABC, abstractmethod
-from collections.abc import ItemsView, Iterable, Iterator, Mapping, ValuesView
+from collections.abc import Collection, ItemsView, Iterable, Iterator, Mapping, ValuesView
 from contextlib import suppress
 from functools import cached_property
 from typing import Any, Protocol, Self, cast
@@ -73,6 +73,8 @@ class Sequence(ABC):
         name: "Town01_Light".
         coordinates: "cartesian" or "cylindrical".
         tree: the tree of files that it is read from; None if it is not read from files.
+        awaited: frames whose scans could not be written yet. Grids to which they belong wait for
+            them.
     """
 
     path: str
@@ -81,6 +83,7 @@ class Sequence(ABC):
     name: str
     coordinates: Coordinates
     tree: FileTree | None = None
+    awaited: frozenset[int] = frozenset()
     _given_poses: FloatArray | None = None
 
     @abstractmethod
@@ -615,6 +618,19 @@ class SequenceWriter(ABC):
         """
         raise ConflictError(
             f"{self.location}: this store cannot replace its grid {grid}: write to a new store"
+        )
+
+    def remove_frames(self, fields: Iterable[str], frames: Collection[int]) -> None:
+        """Remove fields of some frames, if they exist.
+
+        Raises:
+            ConflictError: the store cannot remove frames.
+        """
+        raise ConflictError(
+            self.location,
+            expected="the frames of its input only",
+            found=f"the frames {first_names(map(str, sorted(frames)))}, which the input lacks now",
+            advice="this store cannot remove frames: write to a new store",
         )
 
     def close(self) -> None:  # noqa: B027 (most stores have nothing to finish)

@@ -23,7 +23,14 @@ from carlasc.core.geometry import Transform, check_rigid, mirror_poses
 from carlasc.core.grids import Grid, GridSpec, mirror_spec, mirror_voxels
 from carlasc.core.scans import Scan, mirror_scan
 from carlasc.core.tables import remaps_between, to_table
-from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_choice, first_names
+from carlasc.errors import (
+    ArgumentError,
+    FormatError,
+    MissingDataError,
+    check_choice,
+    check_types,
+    first_names,
+)
 from carlasc.metrics.grids import check_same_geometry, compare_grids
 from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.class_files import read_classes
@@ -82,6 +89,7 @@ class Scene:
     palette: PaletteName = "class"
 
     def __post_init__(self) -> None:
+        check_types(Scene, vars(self))
         FrameRange.of(self.frames)
         if self.every < 1:
             raise ArgumentError("every", expected="1 or more", found=str(self.every))

@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import BinaryIO, overload
 
 from carlasc.core.classes import TableUse
-from carlasc.errors import ArgumentError, ConflictError
+from carlasc.errors import ArgumentError, ConflictError, check_types
 from carlasc.storage.files import (
     AnyPath,
     check_target,
@@ -154,6 +154,7 @@ def view(
         DependencyError: the SDK of Rerun or of Foxglove is missing; or for a window, Open3D or a
             library that it needs is missing, or there is no screen.
     """
+    check_types(view, locals())
     started, scene = time.monotonic(), as_scene(source)
     if scene.palette == "height":
         raise ArgumentError("palette", expected="class or colorblind", found="height")

@@ -14,7 +14,7 @@ import numpy as np
 
 from carlasc.core.arrays import Uint8Array
 from carlasc.core.classes import TableUse
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, check_types
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import Sequence as StoredSequence
@@ -145,6 +145,7 @@ def render(
         StorageError: `out` cannot be written; nothing is left behind.
         DependencyError: a package is missing; the message names the extra.
     """
+    check_types(render, locals())
     started = time.monotonic()
     together = not isinstance(source, _ONE)
     scenes = [as_scene(one) for one in ([source] if isinstance(source, _ONE) else source)]
