@@ -14,15 +14,16 @@ from numpy.typing import ArrayLike
 from carlasc.core.arrays import AnyArray, AnyFloatArray, BoolArray, Float32Array, LabelArray
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.grids import VoxelFlag, is_confident
-from carlasc.core.tables import benchmark_remap, remap_named
+from carlasc.core.tables import benchmark_remap
 from carlasc.dataset.fields import Values
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.storage import Sequence, layout
+from carlasc.storage.class_files import read_remap
 from carlasc.storage.field_files import dense_velocity
 
 RemapLike = str | Remap | Mapping[int, int] | ArrayLike | None
-"""Type of `remap` arguments: a name in `carlasc.core.REMAPS`, a Remap, a mapping or table of ids,
-"auto"; None keeps the ids.
+"""Type of `remap` arguments: a name in `carlasc.core.REMAPS`, a JSON or YAML file of classes with a
+map, a Remap, a mapping or table of ids, "auto"; None keeps the ids.
 """
 
 _GREY = (128, 128, 128)
@@ -45,9 +46,8 @@ class LabelMap:
         self.name = self._remap.name if self._remap else "none"
         self.source = self._remap.source if self._remap else classes
         self.target = self._remap.target if self._remap else classes
-        self._table = (
-            self._remap.table if self._remap else np.arange(classes.num_channels, dtype=np.int32)
-        )
+        kept = Remap("none", classes, classes, {i: i for i in classes.names})
+        self._table = (self._remap or kept).table
 
     def __call__(self, labels: LabelArray, where: str) -> LabelArray:
         """Map labels of any shape to the target table, as uint8, or int32 if ids exceed 255.
@@ -63,7 +63,7 @@ class LabelMap:
         if mapped is None and self._remap is not None:
             return self._remap(labels, where)  # raises an error with the id
         if mapped is None:
-            self.source.check(labels, where)
+            self.source.check(labels, where)  # raises an error with the ids and a proposal
             raise FormatError(where, expected=f"class ids of {self.source.name}")
         return mapped
 
@@ -72,7 +72,7 @@ def _as_remap(remap: str | Remap | Mapping[int, int] | ArrayLike, classes: Class
     if isinstance(remap, Remap):
         return remap
     if isinstance(remap, str):
-        return remap_named(remap)
+        return read_remap(remap)
     if isinstance(remap, Mapping):
         if wrong := [f"{a!r}: {b!r}" for a, b in remap.items() if not _are_ids(a, b)]:
             raise ArgumentError("remap", expected="whole numbers as ids", found=wrong[0])

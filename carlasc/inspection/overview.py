@@ -17,6 +17,7 @@ from carlasc.captures.raw import Capture, find_captures
 from carlasc.core.arrays import IntArray
 from carlasc.core.notebook import data_frame
 from carlasc.errors import CarlascError, MissingDataError, check_types, without_credentials
+from carlasc.inspection.staleness import changed_inputs
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath
 from carlasc.storage.folder import FolderSequence
@@ -43,6 +44,8 @@ class GridOverview:
         frames: number of frames.
         parts: which of labels, counts and votes exist.
         made: the record of how the grid was made; None for published data.
+        stale: what changed of its inputs since it was made; empty if nothing is known to have
+            changed.
     """
 
     name: str
@@ -54,6 +57,7 @@ class GridOverview:
     frames: int
     parts: tuple[str, ...]
     made: Mapping[str, Any] | None
+    stale: str = ""
 
 
 @dataclass(frozen=True)
@@ -255,6 +259,7 @@ def _describe_grid(sequence: Sequence, name: str, fields: Mapping[str, int]) -> 
         fields.get(f"{name}/labels", 0),
         parts,
         sequence.params(name).get("carlasc"),
+        changed_inputs(sequence, name),
     )
 
 

@@ -67,12 +67,11 @@ class ScoreTable:
 
     def to_markdown(self) -> str:
         """Return a Markdown table."""
-        table = self.table()
-        lines = [table.header, ["---"] + ["---:"] * (len(table.header) - 1), *table.texts()]
-        rows = (
-            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
-        )
-        return f"{table.title}\n\n" + "\n".join(rows) + "\n"
+        return self.table().to_markdown()
+
+    def to_csv(self) -> str:
+        """Return a CSV table."""
+        return self.table().to_csv()
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return one row per result, with the columns of `table`.

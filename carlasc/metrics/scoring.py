@@ -31,6 +31,9 @@ class Scoring:
             grid.
         actors: also score actors: panoptic quality (PQ), tracking (LSTQ), and velocities.
             Prediction and ground truth need the field `instance`, for velocities also `velocity`.
+        allow_unknown: go on where an id is no class of its table, and count such voxels: they are
+            not scored in the ground truth, and count as free in predictions. Otherwise the frame is
+            not scored.
 
     Raises:
         ArgumentError: a value is not valid.
@@ -41,6 +44,7 @@ class Scoring:
     by: Collection[str] = ()
     rays: bool = False
     actors: bool = False
+    allow_unknown: bool = False
 
     def __post_init__(self) -> None:
         check_types(Scoring, vars(self))

@@ -46,7 +46,7 @@ from carlasc.relabelling.copies import (
     write_in_stages,
 )
 from carlasc.relabelling.from_motion import points_of_actors, scan_sequences_of
-from carlasc.relabelling.predictions import PredictionReader, read_table
+from carlasc.relabelling.predictions import PredictionReader
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
 from carlasc.storage.arrays import NUMBERS, ArrayFormat, read_npy
@@ -57,6 +57,7 @@ from carlasc.storage.camera_files import (
     read_image,
     scan_T_camera,
 )
+from carlasc.storage.class_files import read_classes
 from carlasc.storage.derived_copies import sequences_with_scans
 from carlasc.storage.files import AnyPath
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
@@ -136,7 +137,7 @@ def label_images(
     began = time.perf_counter()
     root = None if pixels is None else Path(pixels)
     by = by if by is not None else "images" if root is None else root.resolve().name
-    table = None if classes is None else read_table(classes)
+    table = None if classes is None else read_classes(classes)[0]
     source = as_source(source)
     given = sequences_with_scans(source)
     shown = {path: PixelClasses.find(one, root) for path, one in given.items()}

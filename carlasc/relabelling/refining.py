@@ -24,7 +24,6 @@ from carlasc.groundtruth.from_scans.sequences import (
     with_estimated_poses,
 )
 from carlasc.groundtruth.options import FromScans
-from carlasc.groundtruth.reporting import digest_of_bytes
 from carlasc.motion.mounting import Mounting, find_mounting
 from carlasc.motion.options import PoseOptions
 from carlasc.motion.refinement import RefinedPoses
@@ -38,6 +37,7 @@ from carlasc.storage.derived_copies import (
     sequences_with_scans,
 )
 from carlasc.storage.files import AnyPath
+from carlasc.storage.inputs import digest_of_bytes
 from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 

@@ -10,7 +10,6 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import fsspec
 import pytest
 from helpers.datasets.captures import read_tree, write_capture
 from helpers.datasets.sequences import files_of
@@ -19,6 +18,7 @@ from helpers.servers.object_store import (
     BUCKET,
     SECRET,
     FaultyServer,
+    client_of,
     environment_for,
     every,
     faulty_server,
@@ -249,7 +249,7 @@ def test_the_example_of_the_documentation_runs(
         text.partition("=")[0] for text in block.replace("export ", "").split() if "=" in text
     }
     assert len(commands) == 6 and variables <= environment_for("").keys()
-    fsspec.filesystem("s3", **options_for(server.url)).mkdir("bucket")
+    client_of(server.url).create_bucket(Bucket="bucket")
     monkeypatch.chdir(tmp_path)
     for command in commands:
         code, _, err = run(*shlex.split(command, comments=True)[1:])

@@ -13,7 +13,7 @@ import time
 import numpy as np
 import pytest
 from helpers.datasets.drives import write_drive
-from helpers.servers.object_store import BUCKET, options_for, s3_server
+from helpers.servers.object_store import BUCKET, client_of, options_for, s3_server
 from helpers.servers.range_server import serve_folder
 
 import carlasc
@@ -342,12 +342,14 @@ class TestStatefulDataLoader:
 def test_a_bucket_is_read_through_the_cache_and_a_new_version_of_it_is_seen(
     drives, truth, tmp_path, workers
 ):
-    import fsspec
-
     with s3_server() as endpoint:
         options = options_for(endpoint)
-        bucket = fsspec.filesystem("s3", **options)
-        bucket.put(str(drives / "served" / "x.zarr"), f"{BUCKET}/x.zarr", recursive=True)
+        bucket = client_of(endpoint)
+        store = drives / "served" / "x.zarr"
+        for file in store.rglob("*"):
+            if file.is_file():
+                key = f"x.zarr/{file.relative_to(store).as_posix()}"
+                bucket.upload_file(str(file), BUCKET, key)
         for _ in range(2):  # the second time from the cache
             dataset = Dataset(
                 carlasc.open(f"s3://{BUCKET}/x.zarr", cache=tmp_path, **options), history=HISTORY
@@ -356,7 +358,7 @@ def test_a_bucket_is_read_through_the_cache_and_a_new_version_of_it_is_seen(
             loader = DataLoader(dataset, BATCH, sampler=sampler, num_workers=workers)
             assert frames_of(loader, truth) == order_of(sampler, 0)
         (_, path), *_ = dataset.cached_files([0])
-        bucket.pipe(f"{BUCKET}/x.zarr/{path}", b"something else")
+        bucket.put_object(Bucket=BUCKET, Key=f"x.zarr/{path}", Body=b"something else")
         with pytest.raises(carlasc.errors.CarlascError, match=r"x\.zarr"):
             Dataset(
                 carlasc.open(f"s3://{BUCKET}/x.zarr", cache=tmp_path, **options), history=HISTORY

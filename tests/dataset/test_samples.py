@@ -587,7 +587,7 @@ def test_damaged_files_are_named_when_they_are_read(tmp_path):
     expect(
         FormatError, "evaluation/labels of frame 1: expected class ids of carla, found 77", tmp_path
     )
-    expect(FormatError, r"expected class ids 0\.\.24 .*, found 77", tmp_path, remap=None)
+    expect(FormatError, r"expected class ids of carla, found 77", tmp_path, remap=None)
     (folder / "evaluation" / "000001.label").write_bytes(b"1234")
     expect(FormatError, "000001.label: expected 4096 bytes", tmp_path)
     (folder / "labels" / "000001.label").write_bytes(bytes(8))

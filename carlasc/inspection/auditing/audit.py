@@ -41,8 +41,9 @@ from carlasc.motion.tracks import MovingActors
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import FolderSink, layout
+from carlasc.storage.inputs import SequenceFiles, combined, content_digests
 from carlasc.storage.protocol import SequenceWriter, Source
-from carlasc.storage.resuming import derived_key, read_derived, scans_digest
+from carlasc.storage.resuming import derived_key, read_derived
 
 _VERSION = 2  # version of the counts: it changes when the same input gives other sums
 _STRETCH, _STRETCHES = 8, 10  # frames of a stretch, and least number of stretches of a sequence
@@ -212,7 +213,9 @@ def _stretches_of(
     """Yield the stretches of a sequence, without actors."""
     writer, digest, scans = None, "", one.scans.frames("points")
     if keep is not None:
-        writer, digest = FolderSink(keep).sequence(one.path), scans_digest(one.scans, scans)
+        writer = FolderSink(keep).sequence(one.path)
+        digests = content_digests(SequenceFiles(one.scans), scans.tolist(), writer)
+        digest = combined(*digests.items())
         if layout.POSES in one.scans.documents():
             digest = derived_key(one.scans, scans, digest)
     size = int(np.clip(len(one.frames) // _STRETCHES, 1, _STRETCH))

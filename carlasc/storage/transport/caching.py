@@ -11,7 +11,7 @@ import hashlib
 import os
 import stat
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -207,6 +207,10 @@ class CachedTree(Tree):
     def entries(self, folder: str = "") -> Mapping[str, bool]:
         """List the remote folder."""
         return self.remote.entries(folder)
+
+    def states(self, paths: Sequence[str]) -> dict[str, str]:
+        """Return the states of the remote files."""
+        return self.remote.states(paths)
 
     def is_file(self, path: str) -> bool:
         """Whether the file exists."""

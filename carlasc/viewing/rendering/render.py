@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from carlasc.core.arrays import Uint8Array
+from carlasc.core.classes import TableUse
 from carlasc.errors import ArgumentError, check_types
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
@@ -76,6 +77,7 @@ class RenderResult:
         elapsed_s: duration, seconds.
         notes: choices that were made for options that were not given, and empty parts of a picture.
         legend: the file of the legend if it is a separate file, or None.
+        source_classes: class table by which the labels were read, and what named it.
     """
 
     out: Path
@@ -88,6 +90,7 @@ class RenderResult:
     elapsed_s: float
     notes: tuple[str, ...]
     legend: Path | None = None
+    source_classes: TableUse | None = None
 
 
 def render(
@@ -197,6 +200,7 @@ def render(
         time.monotonic() - started,
         tuple(_notes_of(readers, pictures)),
         legend_file if entries else None,
+        readers[0].table_use,
     )
 
 

@@ -24,25 +24,29 @@ Fault = Callable[[int, str, str], str | None]
 def s3_server() -> Iterator[str]:
     """Yield the endpoint of an S3 server that has an empty bucket."""
     moto = pytest.importorskip("moto.server")
-    boto3 = pytest.importorskip("boto3")
     pytest.importorskip("obstore")
     logging.getLogger("werkzeug").setLevel(logging.WARNING)  # not a line for each request
     server = moto.ThreadedMotoServer(port=0, verbose=False)
     server.start()
     host, port = server.get_host_and_port()
     endpoint = f"http://{host}:{port}"
-    boto3.client(
-        "s3",
-        endpoint_url=endpoint,
-        aws_access_key_id=KEY,
-        aws_secret_access_key=SECRET,
-        region_name="us-east-1",
-    ).create_bucket(Bucket=BUCKET)
+    client_of(endpoint).create_bucket(Bucket=BUCKET)
     yield endpoint
     # buckets outlive a server
     request = urllib.request.Request(f"{endpoint}/moto-api/reset", method="POST")
     urllib.request.urlopen(request).close()
     server.stop()
+
+
+def client_of(endpoint: str) -> Any:
+    """Return a client of the S3 API that is not ours."""
+    return pytest.importorskip("boto3").client(
+        "s3",
+        endpoint_url=endpoint,
+        aws_access_key_id=KEY,
+        aws_secret_access_key=SECRET,
+        region_name="us-east-1",
+    )
 
 
 def options_for(endpoint: str) -> dict[str, Any]:
