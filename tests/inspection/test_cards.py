@@ -764,9 +764,8 @@ def check_lines(out: Path, about: Any, stated: dict[str, Any]) -> None:
     assert content.get("rai:hasSyntheticData", False) is bool(simulated)
     assert ("simulation" in front_matter(out)["tags"]) is bool(simulated)
     assert ("recorded in a simulator" in text) is bool(simulated)
-    assert glance["frames"].startswith(
-        f"{sum(len(one.frame_numbers()) for one in about.values())} "
-    )
+    frames = sum(len(one.scan_frames()) for one in about.values())
+    assert glance["frames"] == f"{frames} in {len(said)} sequence{'s' * (len(said) > 1)}"
     assert (
         glance["sensors"] == ", ".join(sorted({s.sensor for s in said if s.sensor})) or "not named"
     )
