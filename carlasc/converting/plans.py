@@ -459,9 +459,6 @@ def plan_recording(
             plan.missing.add(handle.number)
         if not writer.has("points", handle.number) or not _finished(plan, handle.number):
             plan.unfinished.add(handle.number)
-    if 0 < len(plan.unfinished) < (every := len(recording.frames)):
-        existing = every - len(plan.unfinished)
-        plan.notes.append(f"an earlier run was continued: {existing} of {every} frames existed")
     return plan
 
 
