@@ -402,7 +402,7 @@ class ScanFolder(Recording):
         if not any(found):
             raise MissingDataError(
                 folder,
-                expected=f"a file {', '.join(_LABELS)} for each scan, called as the scan",
+                expected=f"a file {', '.join(_LABELS)} for each scan",
                 found="none for any scan",
             )
         return found
