@@ -34,7 +34,7 @@ _DETERMINED = np.array([0.2, 0.2, 0.2, *np.deg2rad([1.0, 1.0, 1.0]), 0.03])
 _RELEVANT = np.array([0.15, 0.15, 0.15, *np.deg2rad([0.5, 0.5, 0.5]), 0.02])
 _CERTAIN = 2.0  # values within so many times their error need none either
 # least half width of an interval: scans are not corrected for motion exactly, nor interpolated
-_SYSTEMATIC = np.array([0.02, 0.02, 0.02, *np.deg2rad([0.1, 0.1, 0.1]), 0.005])
+_SYSTEMATIC = np.array([0.02, 0.02, 0.02, *np.deg2rad([0.1, 0.1, 0.1]), 0.01])
 _GROUP = 15  # scans whose errors are similar
 _EXPLAINED = 3.0  # least variance that a value explains, in variances of what remains
 _LIMITS = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5, 2.0])  # greatest values
