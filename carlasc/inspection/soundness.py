@@ -32,12 +32,13 @@ ACCEPTED: Final = "accepted"
 _FRAMES = "move each scan to the frame of its sensor, and write the poses of the sensor"
 _UPRIGHT = "convert again with `--level`, or with the right axes or mount"
 
-_FAR_M, _FEW = 500.0, 1e-3  # no LiDAR sees farther; a greater share of such points is wrong
+# no LiDAR sees farther; a greater share of such points is wrong
+_FAR_M, _FEW = 500.0, 0.001  # fact: far-points
 _TILT = 0.16  # slope of the ground against the sensor, above which grids are tilted
 _STEEPEST = 0.8  # greatest slope that is looked for
 _ABOVE_M = -0.05  # ground that is higher than this below the sensor is above it
 _SEEN = 0.5  # ground must be found in this share of the scans
-_EMPTY = 0.1  # greatest share of grids without an occupied voxel
+_EMPTY = 0.1  # greatest share of grids without an occupied voxel; fact: empty-grids
 # Scans that move so far while their poses stand are in one frame, which they were moved to.
 _CENTRE_M, _STANDING = 3.0, 0.2
 

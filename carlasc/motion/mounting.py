@@ -30,7 +30,6 @@ _STEP = np.array([0.05, 0.05, 0.05, 2e-3, 2e-3, 2e-3, 0.01])  # steps of the num
 # greatest error of a known value
 _DETERMINED = np.array([0.2, 0.2, 0.2, *np.deg2rad([1.0, 1.0, 1.0]), 0.03])
 # smaller values need no correction
-# fact: relevant-mounting
 _RELEVANT = np.array([0.15, 0.15, 0.15, *np.deg2rad([0.5, 0.5, 0.5]), 0.02])
 _CERTAIN = 2.5  # values within so many times their error need none either
 # least half width of an interval: scans are not corrected for motion exactly, nor interpolated
