@@ -41,15 +41,10 @@ from carlasc.inspection.image_alignment import compare_images, judge_images
 from carlasc.inspection.pose_quality import check_poses, check_times, describe_mounting
 from carlasc.inspection.soundness import (
     CHECKS,
-    GROUND,
-    OCCUPIED,
     OVERLAP,
-    RANGE,
     ScanFacts,
-    check_occupied,
     judge,
     record_accepted,
-    recorded,
     untested,
 )
 from carlasc.inspection.staleness import check_inputs
@@ -192,7 +187,7 @@ def validate(
         if not run.is_alone:
             step(plan.steps)
     if unknown := sorted({*accept} - {*CHECKS} - {finding.check for finding in findings}):
-        raise ArgumentError("accept", expected=f"checks, such as {GROUND}", found=unknown[0])
+        raise ArgumentError("accept", expected=f"checks, such as {OVERLAP}", found=unknown[0])
     record_accepted(opened, findings, accept)
     return ValidationResult(opened.location, tuple(findings), tuple(reports))
 
@@ -244,19 +239,15 @@ def _examine(plan: _CheckedFrames, step: Callable[[], None] = lambda: None) -> _
         findings.extend(check_shapes(sequence, frame, with_grids=described))
         step()
     facts, evidence, below = ScanFacts(), dict[str, GridEvidence](), dict[str, GroundBelow]()
-    occupied: dict[str, list[bool]] = {}
     for frame in plan.read:
         if described:
             findings.extend(check_values(sequence, frame))
-            _measure_grids(sequence, frame, facts, evidence, below, occupied)
+            _measure_grids(sequence, frame, facts, evidence, below)
         step()
-    made = [OCCUPIED] if occupied else []
+    made = facts.made(sequence) if described else []
     if described:
         findings.extend(check_reports(sequence, plan.read))
-        findings.extend(recorded(sequence))
-        if "points" in sequence.fields():
-            made += [RANGE, GROUND] if sequence.metadata.has_rays else [RANGE]
-            findings.extend(facts.findings(sequence))
+        findings.extend(facts.findings(sequence))
         findings.extend(check_inputs(sequence))
     shares = {}
     for name, grid in evidence.items():
@@ -265,8 +256,6 @@ def _examine(plan: _CheckedFrames, step: Callable[[], None] = lambda: None) -> _
             shares[name] = diagnosis.share
             findings.extend(_judge_grid(sequence, name, grid.spec, diagnosis))
         findings.extend(below[name].findings(sequence, name))
-    for name, own in occupied.items():
-        findings.extend(check_occupied(sequence, name, own))
     poses, overlap = _diagnose_poses(sequence)
     if poses is not None and overlap is not None:
         made.append(OVERLAP)
@@ -305,7 +294,6 @@ def _measure_grids(
     facts: ScanFacts,
     evidence: dict[str, GridEvidence],
     below: dict[str, GroundBelow],
-    occupied: dict[str, list[bool]],
 ) -> None:
     """Measure the points of a frame, and compare them with its grids.
 
@@ -325,7 +313,7 @@ def _measure_grids(
             grid = sequence.grid(name, frame)
         except CarlascError:
             continue
-        occupied.setdefault(name, []).append(bool(((grid.labels != 0) & grid.known).any()))
+        facts.occupied.setdefault(name, []).append(bool((grid.labels * grid.known).any()))
         if points is not None and ground is not None:
             evidence.setdefault(name, GridEvidence(grid.spec)).add(points, labels, grid)
             below.setdefault(name, GroundBelow(grid.spec)).add(ground)

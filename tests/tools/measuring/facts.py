@@ -51,7 +51,8 @@ CONSTANTS: dict[str, dict[str, str]] = {
     },
     "docs/commands/regrid.md": {"2 GB": "large-frame[1]"},
     "docs/commands/validate.md": {
-        "0.02 s": "relevant-mounting[6]",
+        "0.1%": "far-points[1]",
+        "10%": "empty-grids",
     },
     "docs/commands/view.md": {
         "10 frames per second": "film-rate",
