@@ -82,6 +82,7 @@ class RecordingPlan:
         notes: notes for the user on poses and times, one line each.
         findings: what is probably wrong.
         force: whether estimated poses are not checked.
+        voxel_m: size of the voxels of the odometry; None: by the distances of points.
         missing: numbers of the frames whose scan is not written yet.
         unfinished: numbers of the frames without a scan, or without the fields from the motion of
             actors.
@@ -101,6 +102,7 @@ class RecordingPlan:
     notes: list[str] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     force: bool = False
+    voxel_m: float | None = None
     missing: set[int] = field(default_factory=set)
     unfinished: set[int] = field(default_factory=set)
     again: bool = False
@@ -450,6 +452,7 @@ def plan_recording(
         seen.notes,
         seen.findings,
         force=options.force,
+        voxel_m=options.odometry_voxel_m,
     )
     for handle in recording.frames:
         if not writer.has("points", handle.number):
@@ -794,14 +797,9 @@ class _ReadUsable:
 
 
 def estimate_poses(
-    recording: Recording,
-    converter: Converter,
-    times: FloatArray,
-    step: Callable[[], object],
-    run: Run,
-    checked: str | None,
+    plan: RecordingPlan, converter: Converter, step: Callable[[], object], run: Run
 ) -> FloatArray:
-    """Estimate the pose of each scan with KISS-ICP.
+    """Estimate the pose of each scan with odometry.
 
     A frame without a scan gets the pose of the scan before it.
 
@@ -810,12 +808,10 @@ def estimate_poses(
     scans with too few points.
 
     Args:
-        recording: its scans.
+        plan: its scans, and how their poses are estimated.
         converter: the converter, for the range of points to use.
-        times: (F,) seconds by frame number.
         step: called for each frame.
         run: how the reading of scans is spread.
-        checked: the recording, for errors; None if the poses are accepted without a check.
 
     Returns:
         (F, 4, 4) first_T_scan by frame number, right-handed.
@@ -825,11 +821,11 @@ def estimate_poses(
         MissingDataError: no scan has enough points.
         DependencyError: kiss-icp is not installed.
     """
-    rig = Rig.of(recording)
+    recording = plan.recording
     errors: list[CarlascError | OSError] = []
 
     def scans() -> Iterator[tuple[int, UsableScan]]:
-        with closing(run_all(_ReadUsable(rig), recording.frames, run)) as read:
+        with closing(run_all(_ReadUsable(plan.rig), recording.frames, run)) as read:
             for handle, scan in zip(recording.frames, read, strict=True):
                 step()
                 if isinstance(scan, Exception):
@@ -837,26 +833,22 @@ def estimate_poses(
                 else:
                     yield handle.number, scan
 
-    poses = dict(follow(scans(), converter, times, checked))
+    poses = dict(follow(scans(), converter, plan))
     if len(errors) == len(recording.frames):
         raise errors[0]
     return fill_gaps(poses, recording)
 
 
 def follow(
-    scans: Iterable[tuple[int, UsableScan]],
-    converter: Converter,
-    times: FloatArray,
-    checked: str | None,
+    scans: Iterable[tuple[int, UsableScan]], converter: Converter, plan: RecordingPlan
 ) -> Iterator[tuple[int, FloatArray]]:
     """Yield the frame number and the (4, 4) first_T_scan of each scan with enough points, estimated
-    with KISS-ICP.
+    with odometry.
 
     Args:
         scans: frame numbers and scans, in order.
         converter: the converter, for the range of points to use.
-        times: (F,) seconds by frame number.
-        checked: the recording, for errors; None if the poses are accepted without a check.
+        plan: how poses are estimated; gets a note on what was chosen.
 
     Raises:
         DependencyError: kiss-icp is not installed.
@@ -872,7 +864,7 @@ def follow(
         for number, scan in scans:
             if len(scan[0]) >= odometry.MIN_POINTS:
                 numbers.append(number)
-                read_at.append(float(times[number]))
+                read_at.append(float(plan.times[number]))
                 centres.add(scan[0])
                 yield scan
 
@@ -882,12 +874,14 @@ def follow(
             times=read_at,
             min_range_m=converter.min_range_m or 0.0,
             max_range_m=converter.max_range_m or 100.0,
+            voxel_m=plan.voxel_m,
+            note=plan.notes.append,
         )
     ):
         poses.append(pose)
         yield numbers[index], pose
-    if poses and checked is not None:
-        centres.check(np.stack(poses), checked)
+    if poses and plan.checked is not None:
+        centres.check(np.stack(poses), plan.checked)
 
 
 def fill_gaps(poses: Mapping[int, FloatArray], recording: Recording) -> FloatArray:

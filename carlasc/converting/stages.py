@@ -300,16 +300,7 @@ class Conversion:
         # the poses correct the scans: each scan is read twice
         if plan.poses is None and plan.rig.needs_motion:
             self.steps.expect(len(plan.recording.frames))
-            plan.take_estimate(
-                estimate_poses(
-                    plan.recording,
-                    self.converter,
-                    plan.times,
-                    self.steps,
-                    self.run_options,
-                    plan.checked,
-                )
-            )
+            plan.take_estimate(estimate_poses(plan, self.converter, self.steps, self.run_options))
             write_poses(plan, self.target)
         velocities = self._read_scans()
         if plan.poses is not None:
@@ -446,7 +437,7 @@ class Conversion:
                     waiting[result.number] = result
                     yield result.number, (points, None)
 
-        for number, pose in follow(scans(), self.converter, self.plan.times, self.plan.checked):
+        for number, pose in follow(scans(), self.converter, self.plan):
             yield waiting.pop(number), pose
 
     def _work(self, blocks: Sequence[Block]) -> Iterator[ConvertedFrame]:
