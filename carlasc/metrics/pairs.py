@@ -104,14 +104,22 @@ def pair_grids(
         names = _first([grids.path or grids.location for grids in alone])
         missing = f"{len(alone)} of {len(predictions)} predicted sequences have no ground truth"
         notes.append(f"{missing} and were not scored: {names}")
-    for pair in pairs:
-        true = set(pair.truth.frames().tolist())
-        if extra := [n for n in pair.prediction.frames().tolist() if n not in true]:
-            names = _first([pair.prediction.name_of(number) for number in extra])
-            where = f" of {pair.truth.path}" if pair.truth.path else ""
+    for prediction in predictions:
+        found = [pair.truth for pair in pairs if pair.prediction.location == prediction.location]
+        if found and (extra := _without_truth(prediction, found)):
+            where = f" of {prediction.path}" if prediction.path else ""
             frames = count(len(extra), "predicted frame")
-            notes.append(f"{frames}{where} without ground truth: {names}")
+            notes.append(f"{frames}{where} without ground truth: {_first(extra)}")
     return pairs, tuple(notes)
+
+
+def _without_truth(prediction: GridFrames, truths: list[GridFrames]) -> list[str]:
+    """Return the names of the frames of a prediction that none of its true grids has."""
+    if isinstance(prediction, VoxelFrames) and not prediction.numbered:
+        files = [truth.files.keys() for truth in truths if isinstance(truth, VoxelFrames)]
+        return sorted(prediction.files.keys() - set().union(*files))
+    numbers = {number for truth in truths for number in truth.frames().tolist()}
+    return [str(n) for n in prediction.frames().tolist() if n not in numbers]
 
 
 def _first(names: list[str]) -> str:

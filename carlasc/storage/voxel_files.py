@@ -137,9 +137,13 @@ class VoxelFormat:
         """Yield the grids at a place, each with its name: a folder above the files, a folder of
         some of them, or one file.
         """
+        seen = set[Path]()
         for grid, template in self.files.items():
             found: dict[tuple[str, Path], dict[str, Path]] = {}
             for path, names in matches(place, template):
+                if path in seen:
+                    continue
+                seen.add(path)
                 folder = place if place.is_dir() and "sequence" not in names else path.parent
                 if "sequence" in names:
                     depth = template.count("/") - template[: template.index("{sequence")].count("/")

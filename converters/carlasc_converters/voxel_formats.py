@@ -249,7 +249,10 @@ SSCBENCH_FILES = replace(
 PREPROCESSED = replace(
     _KITTI,
     name="SemanticKITTI, preprocessed",
-    files={"labels": "labels/{sequence=[0-9][0-9]}/{frame}_1_1.npy"},
+    files={
+        "labels": "labels/{sequence=[0-9][0-9]}/{frame}_1_1.npy",
+        "preprocess": "preprocess/labels/{sequence=[0-9][0-9]}/{frame}_1_1.npy",
+    },
     classes=SEMANTICKITTI19,
     read=read_preprocessed,
     poses=None,
@@ -257,7 +260,10 @@ PREPROCESSED = replace(
 SSCBENCH_PREPROCESSED = replace(
     PREPROCESSED,
     name="SSCBench, preprocessed",
-    files={"labels": "labels/{sequence=*_sync}/{frame}_1_1.npy"},
+    files={
+        name: template.replace("[0-9][0-9]", "*_sync")
+        for name, template in PREPROCESSED.files.items()
+    },
     classes=SSCBENCH,
     benchmark=("sscbench",),
 )
