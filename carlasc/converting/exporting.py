@@ -283,6 +283,9 @@ def _exists(exporter: Exporter, sequence: storage.Sequence, frame: int, folder: 
     return all(has_content(folder / file) for file in files)
 
 
+_TEXTS = "-1"  # in the place of a frame: files that belong to no single frame
+
+
 class _RootFiles(FolderWriter):
     """Keeps records as files in the folder of another data set: a reader of that data set could
     take a folder for one of its own.
@@ -337,6 +340,7 @@ class _ExportedFrom:
             ]
             whole = combined(sorted(own.items()), texts)
             written = {str(frame): self._files(frame) for frame in exported.frames}
+            written[_TEXTS] = "\n".join(exporter.documents(sequence))
             self._now = MadeFrom(whole, own, written)
             self.changed = self.is_known and self._before.whole != whole
 
@@ -353,12 +357,14 @@ class _ExportedFrom:
         return ""
 
     def remove_gone(self) -> None:
-        """Remove the files of frames that the sequence has no longer."""
-        left = set(self._exporter.frames(self._sequence))
+        """Remove the files of frames that the sequence has no longer, and other files that the
+        export has no longer.
+        """
+        left = {str(frame) for frame in self._exporter.frames(self._sequence)}
+        texts = set() if self._now is None else set(self._now.frames[_TEXTS].splitlines())
         for frame, files in self._before.frames.items():
-            if int(frame) not in left:
-                for file in files.splitlines():
-                    (self._folder / file).unlink(missing_ok=True)
+            for file in () if frame in left else set(files.splitlines()) - texts:
+                (self._folder / file).unlink(missing_ok=True)
 
     def write(self) -> None:
         """Write the record."""
