@@ -47,7 +47,7 @@ from carlasc.inspection.soundness import (
     record_accepted,
     untested,
 )
-from carlasc.inspection.staleness import check_inputs
+from carlasc.inspection.staleness import check_inputs, check_sample
 from carlasc.motion.ground import ground_of
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
@@ -143,6 +143,7 @@ def validate(
     *,
     every: int | None = None,
     accept: Collection[str] = (),
+    sample: int = 0,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> ValidationResult:
     """Check a data set: files against each other, values, poses, times, and scans against poses and
@@ -158,6 +159,8 @@ def validate(
             sequence.
         accept: checks whose warnings are true of the place, as in a tunnel: carlasc.json of the
             sequence then says so.
+        sample: number of frames of each grid that are made again from the scans beside it and
+            compared.
         run: how the work is spread over the sequences, with a callback for progress.
 
     Returns:
@@ -182,6 +185,9 @@ def validate(
         examined = run_all(_examine, plans, run, lost=_fail)
     for plan, (in_sequence, report) in zip(plans, examined, strict=True):
         named = [replace(finding, sequence=plan.sequence.path) for finding in in_sequence]
+        if sample > 0:
+            path, more = plan.sequence.path, check_sample(plan.sequence, sample, run)
+            named += [replace(finding, sequence=path) for finding in more]
         findings += sorted(named, key=lambda finding: SEVERITIES.index(finding.severity))
         reports.append(report)
         if not run.is_alone:
