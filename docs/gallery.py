@@ -3,8 +3,8 @@
 
 Everything is simulated, so nothing has to be downloaded. The script prints how long each command
 takes: fourteen minutes in all on two cores that other programs used at the same time. It needs
-three gigabytes of disk while it runs. With names of sections, only these are made, with the data that
-they need.
+three gigabytes of disk while it runs. With names of sections, only these are made, with the data
+that they need.
 """
 
 from __future__ import annotations
