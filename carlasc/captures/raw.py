@@ -158,6 +158,13 @@ class Capture:
         self.location = self.tree.where(self._folder.rstrip("/"))
         self.classes = classes
 
+    @property
+    def is_simulated(self) -> bool:
+        """Whether `carlasc simulate` or `carlasc capture` recorded it, whose settings are beside
+        it.
+        """
+        return not {"simulation.json", "recording.json"}.isdisjoint(self._entries(""))
+
     @cached_property
     def sensors(self) -> tuple[int, ...]:
         """The sorted numbers of sensors: all sensors with at least one of the five folders.

@@ -60,6 +60,8 @@ class Simulator(Capture, ABC):
     frames must not be mixed in one capture.
     """
 
+    is_simulated = True
+
     def __init__(
         self,
         *,
@@ -113,6 +115,8 @@ class Simulator(Capture, ABC):
         Raises:
             DependencyError: a package is missing.
         """
+
+    is_simulated = True
 
     @cached_property
     def sensors(self) -> tuple[int, ...]:

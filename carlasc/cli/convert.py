@@ -159,7 +159,7 @@ def convert(
         making.votes.make(),
         follow_ground=not bounded,
     )
-    with run.spread(f"convert {name}") as spread:
+    with run.spread(f"convert {name}", "steps") as spread:
         result = written.make(
             name,
             source,

@@ -341,7 +341,9 @@ def _place(
     else:
         points = cloud.points.copy()
         points[:, :3] = move_each(cloud.points, scan_T_then, tick_of)
-    if cloud.origins is not None:
+    if cloud.origins is not None and not sensor.deskewed:
+        origins = move_each(cloud.origins, scan_T_then, tick_of).astype(np.float32)
+    elif cloud.origins is not None:
         origins = transform_points(scan_T_points, cloud.origins).astype(np.float32)
     else:
         origins = _thinned(

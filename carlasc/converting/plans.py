@@ -65,22 +65,41 @@ _AROUND_S = 1.0  # part of the trajectory that a frame needs: longer than a swee
 
 
 @dataclass
-class RecordingPlan:
+class Examined:
+    """What is known of a recording before it is converted.
+
+    Attributes:
+        recording: the recording, with the frames that are converted, and upright.
+        times: (F,) seconds by frame number, by the recording's clock.
+        has_times: whether the recording has times.
+        trajectory: poses of the vehicle by the same clock; None until they are estimated.
+        poses: (F, 4, 4) first_T_scan by frame number, right-handed; None until they are estimated.
+        mount: how the sensor is mounted; None if no ground was found, or not looked for.
+        notes: notes for the user on poses and times, one line each.
+        findings: what is probably wrong ("warning"), and what stops a conversion ("error").
+    """
+
+    recording: Recording
+    times: FloatArray
+    has_times: bool
+    trajectory: Trajectory | None
+    poses: FloatArray | None
+    mount: Mount | None
+    notes: list[str]
+    findings: list[Finding]
+
+
+@dataclass
+class RecordingPlan(Examined):
     """One recording and its output.
 
     Attributes:
-        recording: the recording.
         writer: the output.
-        times: (F,) seconds by frame number, by the recording's clock.
-        trajectory: poses of the vehicle by the same clock; None until they are estimated.
-        poses: (F, 4, 4) first_T_scan by frame number, right-handed; None until they are estimated.
         pose_source: where poses come from.
         boxes: the annotated boxes by frame number, with class ids of the data set, right-handed, in
             the frame of the scan; None if the data set has no boxes.
         flow: whether flow is written.
         voxels: geometry of the recording's own voxel grids, right-handed, if they are written.
-        notes: notes for the user on poses and times, one line each.
-        findings: what is probably wrong.
         force: whether estimated poses are not checked.
         missing: numbers of the frames whose scan is not written yet.
         unfinished: numbers of the frames without a scan, or without the fields from the motion of
@@ -89,17 +108,11 @@ class RecordingPlan:
             data set changed.
     """
 
-    recording: Recording
     writer: SequenceWriter
-    times: FloatArray
-    trajectory: Trajectory | None
-    poses: FloatArray | None
     pose_source: str
     boxes: dict[int, Boxes] | None
     flow: bool
     voxels: GridSpec | None = None
-    notes: list[str] = field(default_factory=list)
-    findings: list[Finding] = field(default_factory=list)
     force: bool = False
     missing: set[int] = field(default_factory=set)
     unfinished: set[int] = field(default_factory=set)
@@ -214,31 +227,6 @@ def choose_recordings(
 def sequence_path(recording: Recording) -> str:
     """Return the path of the output sequence of a recording."""
     return f"{recording.split}/{recording.name}/cartesian"
-
-
-@dataclass(frozen=True)
-class Examined:
-    """What is known of a recording before it is converted.
-
-    Attributes:
-        recording: the recording, with the frames that are converted, and upright.
-        times: (F,) seconds by frame number, by its clock.
-        has_times: whether the recording has times.
-        trajectory: poses of the vehicle by the same clock; None if they must be estimated.
-        poses: (F, 4, 4) first_T_scan by frame number; None if they must be estimated.
-        mount: how the sensor is mounted; None if no ground was found.
-        notes: notes for the user, one line each.
-        findings: what is probably wrong ("warning"), and what stops a conversion ("error").
-    """
-
-    recording: Recording
-    times: FloatArray
-    has_times: bool
-    trajectory: Trajectory | None
-    poses: FloatArray | None
-    mount: Mount | None
-    notes: list[str]
-    findings: list[Finding]
 
 
 def examine(
@@ -438,17 +426,12 @@ def plan_recording(
     recording = seen.recording
     boxes = _read_boxes(recording)
     plan = RecordingPlan(
-        recording,
-        writer,
-        seen.times,
-        seen.trajectory,
-        seen.poses,
-        KISS_ICP if seen.trajectory is None else FILE,
-        boxes,
-        flow and (boxes is not None or (recording.has_labels and recording.has_instances)),
-        _check_voxels(recording, writer, target) if voxels else None,
-        seen.notes,
-        seen.findings,
+        **vars(seen),
+        writer=writer,
+        pose_source=KISS_ICP if seen.trajectory is None else FILE,
+        boxes=boxes,
+        flow=flow and (boxes is not None or (recording.has_labels and recording.has_instances)),
+        voxels=_check_voxels(recording, writer, target) if voxels else None,
         force=options.force,
     )
     for handle in recording.frames:
@@ -456,6 +439,9 @@ def plan_recording(
             plan.missing.add(handle.number)
         if not writer.has("points", handle.number) or not _finished(plan, handle.number):
             plan.unfinished.add(handle.number)
+    if 0 < len(plan.unfinished) < (every := len(recording.frames)):
+        existing = every - len(plan.unfinished)
+        plan.notes.append(f"an earlier run was continued: {existing} of {every} frames existed")
     return plan
 
 

@@ -8,16 +8,17 @@ sequence keeps.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from carlasc.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray
-from carlasc.core.geometry import Transform, axes_named
+from carlasc.core.geometry import DIRECTIONS, Transform, thin
 from carlasc.errors import FormatError
 from carlasc.inspection.findings import Finding, Severity
 from carlasc.motion.ground import ground_plane
 
+_ENOUGH = 30000  # points of a scan in which the ground is looked for
 _SAMPLE = 4000  # points of a scan that say how far away they are
 # no LiDAR on a carrier sees half of its points, or all of them, so far away
 _FARTHEST_M, _ALL_FAR_M = 2000.0, 250.0
@@ -32,8 +33,9 @@ _UPS = (("+z", "flu"), ("-z", "frd"), ("-y", "rdf"), ("+y", "rub"), ("+x", "ulb"
 _LEVEL, _STEEP = 0.25, 0.8  # slopes of the ground of an upright sensor, and of a tilted one
 _LEAST_M = 0.2  # ground must be at least this far below the sensor
 # Ground in an unusual direction reaches beyond this distance, in this share of all directions, and
-# at most this share of the points is below it: so do no walls and ceilings.
-_WIDE_M, _WIDE, _BELOW_M, _BELOW = 8.0, 0.2, 0.5, 0.03
+# at most this share of the near points is below it: so do no walls and ceilings.
+_WIDE_M, _WIDE = 8.0, 0.3
+_NEAR_M, _BELOW_M, _BELOW = 15.0, 0.5, 0.02
 _SECTORS, _ON_GROUND_M = 36, 0.1
 _TILTED, _FALLEN = 5.0, 14.0  # degrees: grids, and the ground below the sensor, need less
 
@@ -122,40 +124,54 @@ def find_mount(scans: Sequence[AnyFloatArray]) -> Mount | None:
     Args:
         scans: (N, 3 or more) points, metres, in the frame of the sensor.
     """
+    usual = _mount(scans, *_UPS[0], _LEVEL, certain=False)
+    if usual is not None and usual.degrees < _TILTED:
+        return usual
     for ups in (_UPS[:2], _UPS[2:]):
         for steepest in (_LEVEL, _STEEP):
             for up, axes in ups:
-                turn = axes_named(axes)
-                unusual = up != "+z" or steepest > _LEVEL
-                planes = [
-                    plane
-                    for points in scans
-                    if (plane := _ground(points[:, :3] @ turn[:3, :3].T, steepest, unusual))
-                    is not None
-                ]
-                if 2 * len(planes) <= len(scans):
-                    continue
-                # whole tenths of a degree, so that other scans give the same rotation
-                slope = np.median(planes, axis=0)
-                normal = np.array([-slope[0], -slope[1], 1.0]) / np.hypot(1, np.hypot(*slope[:2]))
-                degrees = round(float(np.rad2deg(np.arccos(normal[2]))), 1)
-                return Mount(
-                    up, axes, degrees, -float(slope[2] * normal[2]), _level(normal, degrees) @ turn
-                )
-    return None
+                if found := _mount(scans, up, axes, steepest, certain=True):
+                    return found
+    # stairs, or a slope: the sensor is not certainly tilted
+    return None if usual is None else replace(usual, degrees=0.0, level_T_scan=np.eye(4))
 
 
-def _ground(points: AnyFloatArray, steepest: float, unusual: bool) -> FloatArray | None:
-    """Return the plane of the ground, as `ground_plane` does; None if it cannot be ground."""
+def _mount(
+    scans: Sequence[AnyFloatArray], up: str, axes: str, steepest: float, *, certain: bool
+) -> Mount | None:
+    """Return the mount of a sensor with these axes; None if most scans show no ground then."""
+    turn = np.eye(4)
+    turn[:3, :3] = np.transpose([DIRECTIONS[letter] for letter in axes])
+    grounds = [
+        ground
+        for points in scans
+        if (ground := _ground(thin(points, _ENOUGH)[:, :3] @ turn[:3, :3].T, steepest, certain))
+        is not None
+    ]
+    if 2 * len(grounds) <= len(scans):
+        return None
+    x, y, z = np.median(grounds, axis=0)
+    normal = np.array([-x, -y, 1.0]) / np.sqrt(x * x + y * y + 1)
+    # whole tenths of a degree, so that other scans give the same rotation
+    degrees = round(float(np.rad2deg(np.arccos(normal[2]))), 1)
+    return Mount(up, axes, degrees, -float(z * normal[2]), _level(normal, degrees) @ turn)
+
+
+def _ground(points: AnyFloatArray, steepest: float, certain: bool) -> FloatArray | None:
+    """Return the plane of the ground, as `ground_plane` does; None if it is not below the sensor,
+    or, to be `certain`, if it is not wide, or has points below it.
+    """
     plane = ground_plane(points, steepest)
     if plane is None or plane[2] > -_LEAST_M:
         return None
-    if unusual:
+    if certain:
         x, y, z = points.T
         above = z - plane[0] * x - plane[1] * y - plane[2]
-        far = (np.abs(above) < _ON_GROUND_M) & (np.hypot(x, y) > _WIDE_M)
+        flat = np.hypot(x, y)
+        far = (np.abs(above) < _ON_GROUND_M) & (flat > _WIDE_M)
         sectors = np.unique(np.arctan2(y, x)[far] // (2 * np.pi / _SECTORS))
-        if len(sectors) < _WIDE * _SECTORS or np.mean(above < -_BELOW_M) > _BELOW:
+        below = np.mean(above[flat < _NEAR_M] < -_BELOW_M)
+        if len(sectors) < _WIDE * _SECTORS or below > _BELOW:
             return None
     return plane
 

@@ -167,7 +167,9 @@ def convert(
     known = {key: value for key, value in said.items() if value not in (None, False)}
     metadata = Metadata(layout.axes, target.classes, converter.sensor, *ranges, origin, known)
 
-    steps = StepCounter(run.progress, sum(len(plan.recording.frames) for plan in plans))
+    every = sum(len(plan.recording.frames) for plan in plans)
+    in_grids = every if isinstance(grids, GridOptions) else 0
+    steps = StepCounter(run.progress, every + in_grids)
     with one_pool(run) as pooled:
         conversions = [
             Conversion(plan, converter, target, layout.images, pooled, steps, allow_gaps)
@@ -183,7 +185,7 @@ def convert(
             sink.finish(incomplete=True)  # missing frames could not be read, and are reported
         made = None
         if isinstance(grids, GridOptions):
-            alone = replace(pooled, part=Part(), progress=steps.stage())
+            alone = replace(pooled, part=Part(), progress=steps.stage(in_grids))
             # without the motion that some frames wait for, grids would be made in another way
             converted = [one for one in conversions if one.has_scans and not one.waits]
             if converted:  # otherwise every frame failed, and is reported

@@ -13,7 +13,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self, SupportsIndex, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, Self, SupportsIndex, cast, overload
 
 import numpy as np
 
@@ -354,6 +354,33 @@ class Dataset(_MapStyle):
             expected=f"the frame of one of the {len(self)} samples",
             found="none",
         )
+
+    def class_counts(self, field: Literal["labels", "point_labels"] = "labels") -> IntArray:
+        """Count the classes of each sample, for samplers that draw rare classes more often.
+
+        All samples are read, without their scans and augmentations.
+
+        Args:
+            field: "labels" counts voxels, without unknown ones if `known` is one of the fields;
+                "point_labels" counts points.
+
+        Returns:
+            (N, K) int64, where K is the largest id of `classes` plus 1.
+
+        Raises:
+            ArgumentError: the samples do not have this field.
+        """
+        check_choice("field", field, [name for name in self.fields if name.endswith("labels")])
+        plain, channels = copy.copy(self), max(self.classes.names) + 1
+        plain.transform = None
+        plain.fields = (field, *({"known"} & set(self.fields) if field == "labels" else ()))
+        plain._grid_fields = replace(self._grid_fields, fields=frozenset(plain.fields))
+        counts = np.zeros((len(self), channels), np.int64)
+        for number, sample in enumerate(plain):
+            labels = sample[field]
+            known = labels[sample.get("known", ...)].ravel()
+            counts[number] = np.bincount(known, minlength=channels)
+        return counts
 
     def __repr__(self) -> str:
         sizes = f"{count(len(self), 'frame')} in {count(len(self._parts), 'sequence')}"

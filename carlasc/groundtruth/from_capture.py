@@ -122,7 +122,10 @@ class CaptureSequence(SequenceInput):
         self.path, self.location, self.metadata = (
             path,
             capture.location,
-            Metadata(classes=capture.classes),
+            Metadata(
+                classes=capture.classes,
+                extra={"simulated": True} if capture.is_simulated else {},
+            ),
         )
         self.capture, self.plan = capture, plan
 

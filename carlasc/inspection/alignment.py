@@ -11,6 +11,7 @@ axis, for instance, changes nothing on a straight road.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -25,10 +26,14 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import CarlascError
 from carlasc.inspection.points_in_voxels import warped_voxels
 from carlasc.inspection.pose_quality import PoseQuality, angles_of, measure_poses
+from carlasc.motion.joint_alignment import AlignmentPass, blocks, spread_of
+from carlasc.motion.solving import principal_axes
 from carlasc.storage.protocol import Sequence
 
 MIN_RANGE_M = 3.0
 MAX_RANGE_M = 30.0
+_INDOORS_M, _NEAR_M = 1.0, 5.0  # nearest points indoors: where half of them are so near
+_STANDS_M_S = 0.1  # slower points stand
 _COLUMN_M = 0.4
 _UPRIGHT_M = 0.6  # points in a column that spans less height are ground
 _FOOT_M = 0.3  # lowest part of an upright column, which counts as ground
@@ -63,6 +68,13 @@ def static_structure(sequence: Sequence, frame: int) -> FloatArray:
     return structure_of(points, labels, flow, sequence.metadata.classes)
 
 
+def standing_points(sequence: Sequence, frame: int) -> AnyFloatArray:
+    """Read the (N, 3) points of a scan that do not move, as far as its flow tells, metres."""
+    points = np.asarray(sequence.read("points", frame))[:, :3]
+    flow = _per_point(sequence, "flow", frame, len(points))
+    return points if flow is None else points[(np.abs(flow) < _STANDS_M_S).all(axis=1)]
+
+
 def structure_of(
     points: AnyFloatArray,
     labels: AnyArray | None,
@@ -80,7 +92,8 @@ def structure_of(
     Returns:
         (M, 3) float64 points, metres, in the frame of the sensor.
     """
-    keep = within(points, MIN_RANGE_M, MAX_RANGE_M)
+    indoors = np.mean(within(points, 0.0, _NEAR_M)) > 0.5
+    keep = within(points, _INDOORS_M if indoors else MIN_RANGE_M, MAX_RANGE_M)
     if labels is not None and bool(labels.any()):
         keep &= _static_classes(classes)[
             # packed stores keep labels in uint8
@@ -89,7 +102,7 @@ def structure_of(
     else:
         keep[keep] = _is_upright(points[keep])
     if flow is not None:
-        keep &= (np.abs(flow) < 0.1).all(axis=1)
+        keep &= (np.abs(flow) < _STANDS_M_S).all(axis=1)
     return points[np.flatnonzero(keep)].astype(np.float64)
 
 
@@ -295,6 +308,81 @@ def diagnose_poses(
     search = not explained and own < _GOOD
     offset = _common_offset(overlaps) if search else None
     return PoseDiagnosis(own, len(overlaps), quality=quality, offset_m=offset)
+
+
+REACH_M = 3.0
+"""Scans within this distance of each other overlap, however much time is between them."""
+_LONG_PAIRS = 12
+# Scans over this distance overlap by at least a share, or by as much of the share of neighbours:
+# where a motion is missing in the poses, they do not.
+_LEAST, _ALIKE, _ENOUGH = 0.25, 0.62, 0.5
+_WALL = AlignmentPass(1.0, 1, 0.06, 0.02)  # surfaces of one scan: cells, thickness
+_WALL_POINTS, _WIDE_M2, _SURFACE_M = 12, 0.02, 50.0
+_OPEN = 0.003  # share of the surfaces that face a direction, below which none determines it
+
+
+@dataclass(frozen=True)
+class LongOverlap:
+    """Whether the poses hold over some metres, however long the sensor takes for them.
+
+    Attributes:
+        share: mean share of a scan's structure that falls on that of the last scan within
+            `REACH_M`; NaN if no scans have enough structure.
+        open_way: (2,) horizontal direction in the frame of the first scan, along which no surface
+            determines the position, as along a tunnel; None if there is none.
+    """
+
+    share: float
+    open_way: FloatArray | None = None
+
+    def is_wrong(self, near: float) -> bool:
+        """Return whether a motion is missing: `near` is the share of neighbouring scans."""
+        return self.open_way is None and self.share < max(_LEAST, min(_ENOUGH, _ALIKE * near))
+
+    @property
+    def why_untested(self) -> str:
+        """Why the motion could not be tested; empty if it was."""
+        if self.open_way is not None:
+            x, y = self.open_way
+            return (
+                f"no surface determines the position along (x, y) = ({x:.1f}, {y:.1f}) in the "
+                "frame of the first scan"
+            )
+        return "" if self.share >= 0 else "scans have too few upright things"
+
+
+def measure_overlap(
+    structure: Callable[[int], FloatArray], points: Callable[[int], AnyFloatArray], poses: Poses
+) -> LongOverlap:
+    """Measure the overlap of scans that are near each other under their poses but far in time, and
+    which directions their surfaces determine.
+
+    Args:
+        structure: returns the (M, 3) structure of the i-th scan.
+        points: returns its (N, 3) points on static things.
+        poses: (F, 4, 4) first_T_sensor of each scan, in order of time; rigid.
+    """
+    shares, facing = [], np.zeros((3, 3))
+    for first in np.unique(np.linspace(0, len(poses) - 2, _LONG_PAIRS).astype(int)).tolist():
+        away = np.linalg.norm(poses[first:, :3, 3] - poses[first, :3, 3], axis=1) > REACH_M
+        last = first + int(away.argmax()) if away.any() else len(poses) - 1
+        target, moved = structure(first), _thin(structure(last), _OFFSET_POINTS)
+        if min(len(target), len(moved)) >= _MIN_POINTS:
+            shares.append(overlap(occupancy(target), relative(poses, first, last), moved))
+        own = points(first)
+        own = own[within(own, _INDOORS_M, _SURFACE_M)].astype(np.float32)
+        (block,) = blocks([own], poses[first : first + 1], _WALL.cell_m, shift=0.0)
+        alone = block.sums[:, 0] >= _WALL_POINTS
+        _, spread = spread_of(block, poses[first : first + 1], 1)
+        values, vectors = principal_axes(spread[alone])
+        flat = (values[:, 0] < np.minimum(_WALL.flat * values[:, 1], _WALL.thick_m**2)) & (
+            values[:, 1] > _WIDE_M2
+        )
+        normals = vectors[flat][:, :, 0]
+        facing += normals.T @ normals
+    ways, directions = np.linalg.eigh(facing[:2, :2])  # the ground determines the height
+    open_way = directions[:, 0] if ways[0] <= _OPEN * np.trace(facing) else None
+    return LongOverlap(float(np.mean(shares)) if shares else math.nan, open_way)
 
 
 def choose_pairs(poses: Poses, max_pairs: int) -> list[tuple[int, int]]:

@@ -180,7 +180,7 @@ _DRIVE = SimulatedDrive()
 SCENES: Final = {
     "room": _scene(_ROOM, _in_room, 1.0, _CART),
     "corridor": _scene(_hall(90.0, 2.0, 2.6), _along_corridor, 1.0, _CART, range_m=20.0),
-    "stairwell": _scene(_STAIRS, _upstairs, 1.5, _PERSON),
+    "stairwell": _scene(_STAIRS, _upstairs, 1.5, _PERSON, elevation_deg=(-45.0, 45.0)),
     "walking-robot": _scene(_SQUARE, _on_legs, 0.5, _ROBOT),
     "drone": _scene(_FIELD, _in_the_air, 0.0, elevation_deg=(-88.0, -40.0)),
     "upside-down": _scene(_DRIVE.things, None, 1.8, turned_rad=(np.pi, 0.0)),

@@ -27,6 +27,8 @@ from carlasc_converters.point_fields import (
 )
 from carlasc_converters.point_files import read_columns
 
+_NOT_ALL = {"label", "instance"}  # fields that some of the scans may lack
+
 
 @dataclass(frozen=True)
 class ScanOptions:
@@ -83,7 +85,7 @@ class ScanFile(FrameHandle):
     def _read(self, index: int, path: str) -> Cloud:
         columns = read_columns(Path(path), self.options.columns)
         fields = named_fields(columns, path, self.clock)
-        if set(fields) != set(self.fields):
+        if set(fields) - _NOT_ALL != set(self.fields) - _NOT_ALL:
             raise FormatError(
                 path,
                 expected=f"the fields of the first scan ({', '.join(self.fields)})",
@@ -92,10 +94,15 @@ class ScanFile(FrameHandle):
         points, seconds = fields["points"], None
         if self.clock is not None:
             seconds = self.clock.seconds(columns, returns(columns), self.stamp, path)
-        labels = fields.get("label") if self.options.has_classes else None
+        labels, instances = fields.get("label"), fields.get("instance")
         if self.labels is not None and index == 0:
             labels = read_labels(Path(self.labels), len(points))
-        instances = fields.get("instance") if self.options.has_classes else None
+        if not self.options.has_classes:
+            labels = instances = None
+        elif labels is None and (self.options.label_dir or "label" in self.fields):
+            labels = np.zeros(len(points), np.uint32)  # other scans have labels
+        if labels is not None and instances is None and "instance" in self.fields:
+            instances = np.zeros(len(points), np.uint32)
         finite = np.isfinite(points[:, :3]).all(axis=1)
         if not finite.any():
             raise FormatError(

@@ -27,8 +27,9 @@ from carlasc_converters.scans import Scans
 from helpers.converters import bags
 from helpers.errors import raises
 
+from carlasc.converting.assembling import Rig, VehicleMotion, read_scan
 from carlasc.converting.plausibility import check_scan
-from carlasc.core.geometry import quaternions_of, transform_points, translation
+from carlasc.core.geometry import quaternions_of, rotation_z, transform_points, translation
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.testing import SimulatedDrive
 from carlasc.testing.drives import world_T_sensor
@@ -454,3 +455,41 @@ def test_whole_data_with_a_wrong_size_of_rows_are_read():
 def test_the_times_of_a_survey_are_not_those_of_a_scan():
     with raises(FormatError, expected="at most 3 s", found="4414"):
         point_seconds(np.linspace(245369, 249783, 9), "s", "x")
+
+
+@pytest.mark.parametrize("rolling", [True, False])
+def test_a_lidar_that_moves_on_the_vehicle_is_placed_by_the_transforms(tmp_path, rolling):
+    drive = replace(DRIVE, rolling=rolling, frames=4)
+    mount, name = drive.sensors[0].vehicle_T_sensor, drive.sensors[0].name
+
+    def turn(seconds):
+        return rotation_z(0.8 * np.sin(4.0 * seconds))
+
+    def messages(store):
+        found = [one for one in bags.drive_messages(store, drive) if one[0] != "/tf_static"]
+        found = [one for one in found if not one[0].endswith("/points")]
+        for frame, seconds in enumerate(drive.times):
+            scan = drive.scan(frame)
+            turns = np.array([turn(seconds + after) for after in scan.seconds])
+            points = scan.points.copy()
+            points[:, :3] = np.einsum("nji,nj->ni", turns[:, :3, :3], points[:, :3])
+            cloud = bags.velodyne(points, scan.seconds if rolling else None)
+            stamp = bags.START_NS + round(seconds * 1e9)
+            found.append(store.cloud(f"/{name}/points", stamp, cloud, name))
+        for seconds in np.arange(-0.1, drive.times[-1] + 0.1, 0.005):
+            stamp = bags.START_NS + round(seconds * 1e9)
+            found.append(store.transform("/tf", stamp, bags.BASE, name, mount @ turn(seconds)))
+        found.append(store.transform("/tf_static", bags.START_NS, bags.BASE, "imu", mount))
+        return sorted(found, key=lambda message: message[2])
+
+    store = bags.Messages("mcap")
+    bag = bags.write_bag(tmp_path, "mcap", messages(store), store=store)
+    (recording,) = Bag(bag).sequences()
+    trajectory = recording.poses()
+    for frame, handle in enumerate(recording.frames):
+        motion = VehicleMotion(trajectory, recording.times()[frame])
+        scan = read_scan(handle, Rig.of(recording), motion)
+        np.testing.assert_allclose(scan.points[:, :3], drive.scan(frame).deskewed[:, :3], atol=0.01)
+    said = " ".join(recording.notes())
+    assert f"{name} moves on {bags.BASE}" in said
+    assert f"transforms that were not used: {bags.BASE} > imu" in said

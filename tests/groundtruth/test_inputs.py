@@ -268,3 +268,39 @@ def test_parts_make_what_changed_again(drive, tmp_path):
     assert 0 < sum(one.made for one in again) < FRAMES
     regrid(source, SPEC, tmp_path / "fresh", observe=STILL, run=ALONE)
     assert outputs(out) == outputs(tmp_path / "fresh")
+
+
+@pytest.mark.slow
+def test_scans_in_an_object_store(drive, tmp_path, monkeypatch):
+    pytest.importorskip("obstore")
+    from helpers.servers.object_store import BUCKET, client_of, environment_for, s3_server
+
+    with s3_server() as url:
+        for name, value in environment_for(url).items():
+            monkeypatch.setenv(name, value)
+        client, source = client_of(url), copy(drive, tmp_path / "data")
+        place = f"s3://{BUCKET}/changed"
+
+        def upload() -> None:
+            for path in source.rglob("*"):
+                if path.is_file():
+                    key = f"changed/{path.relative_to(source).as_posix()}"
+                    client.put_object(Bucket=BUCKET, Key=key, Body=path.read_bytes())
+
+        upload()
+        out = tmp_path / "out"
+        regrid(place, SPEC, out, observe=STILL, run=ALONE)
+        upload()  # other times, the same content
+        assert regrid(place, SPEC, out, observe=STILL, run=ALONE).made == 0
+        change_points(source, np.random.default_rng(0))
+        upload()
+        again = regrid(place, SPEC, out, observe=STILL, run=ALONE)
+        assert 0 < again.made < FRAMES
+        regrid(place, SPEC, f"s3://{BUCKET}/out", observe=STILL, run=ALONE)
+        change_labels(source, np.random.default_rng(1))
+        upload()
+        assert regrid(place, SPEC, f"s3://{BUCKET}/out", observe=STILL, run=ALONE).made
+        assert regrid(place, SPEC, out, observe=STILL, run=ALONE).made
+        regrid(source, SPEC, tmp_path / "fresh", observe=STILL, run=ALONE)
+        carlasc.unpack(f"s3://{BUCKET}/out", tmp_path / "unpacked", run=ALONE)
+        assert outputs(out) == outputs(tmp_path / "fresh") == outputs(tmp_path / "unpacked")

@@ -297,6 +297,7 @@ def test_a_record_a_report_and_a_card_say_who_predicted(data, predictions, tmp_p
         tmp_path / "card",
         about=carlasc.CardDetails(license="cc-by-4.0"),
         pictures=False,
+        draft=True,
         run=ALONE,
     )
     text = (tmp_path / "card/README.md").read_text()
