@@ -23,6 +23,7 @@ from carlasc.converting.protocol import Failure, check_outside
 from carlasc.converting.registry import load_exporter, read_options
 from carlasc.core.arrays import AnyArray
 from carlasc.core.choices import CompareInputs
+from carlasc.core.classes import TableUse
 from carlasc.errors import (
     CarlascError,
     ConflictError,
@@ -84,6 +85,7 @@ class ExportResult:
     failures: tuple[Failure, ...]
     notes: tuple[str, ...]
     elapsed_s: float
+    source_classes: tuple[TableUse, ...] = ()
 
 
 def export(
@@ -194,6 +196,7 @@ def export(
         tuple(writing.failures),
         tuple(dict.fromkeys(notes)),
         time.perf_counter() - start,
+        tuple(sorted({exported.sequence.table_use() for exported in chosen})),
     )
 
 

@@ -295,6 +295,8 @@ class DriveMap:
     def notes(self) -> tuple[str, ...]:
         """Return remarks on the results, one line each."""
         where, notes, metadata = self.inputs.location, self.inputs.findings(), self.inputs.metadata
+        if self.inputs.feed.has_labels:
+            notes.append(f"{where}: classes {self.inputs.sequence.table_use()}")
         if not self.inputs.feed.has_labels:
             notes.append(
                 f"{where}: the scans have no labels: the map contains geometry only, in one class"
