@@ -1,6 +1,6 @@
 """Training on a tiny data set: what is written, resumed, stopped, and shared among processes."""
 
-from __future__ import annotations
+from __future__ import csv
 
 import json
 import os
@@ -8,6 +8,7 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import annotations
 import numpy as np
 import pytest
 from helpers.datasets.completion import write_split
@@ -59,6 +60,21 @@ def test_a_run_writes_weights_checkpoint_settings_and_curves(data, tmp_path, cap
     events.Reload()
     assert [e.value for e in events.Scalars("val/mIoU")] == pytest.approx(progress.mious)
     assert len(events.Tags()["images"]) == 3
+
+    with (tmp_path / "run" / "epochs.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["epoch"]) for row in rows] == [1, 2, 3, 4]
+    assert [float(row["val/mIoU"]) for row in rows] == pytest.approx(progress.mious)
+    assert [float(row["train/loss"]) for row in rows] == pytest.approx(progress.losses)
+
+
+@pytest.mark.slow
+@pytest.mark.needs("wandb")
+def test_weights_and_biases_logs_without_sending(data, tmp_path):
+    train(data, replace(QUICK, epochs=2, wandb=True), tmp_path / "run", ALONE)
+    (log,) = (tmp_path / "run" / "wandb").glob("offline-run-*/*.wandb")
+    content = log.read_bytes()
+    assert b"val/mIoU" in content and b"train/loss" in content
 
 
 @pytest.mark.slow
