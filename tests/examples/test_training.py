@@ -1,14 +1,15 @@
 """Training on a tiny data set: what is written, resumed, stopped, and shared among processes."""
 
-from __future__ import csv
+from __future__ import annotations
 
+import csv
 import json
 import os
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
-import annotations
 import numpy as np
 import pytest
 from helpers.datasets.completion import write_split
@@ -73,8 +74,10 @@ def test_a_run_writes_weights_checkpoint_settings_and_curves(data, tmp_path, cap
 def test_weights_and_biases_logs_without_sending(data, tmp_path):
     train(data, replace(QUICK, epochs=2, wandb=True), tmp_path / "run", ALONE)
     (log,) = (tmp_path / "run" / "wandb").glob("offline-run-*/*.wandb")
-    content = log.read_bytes()
-    assert b"val/mIoU" in content and b"train/loss" in content
+    end = time.monotonic() + 60  # its service writes the file after the run is finished
+    while b"train/loss" not in log.read_bytes() and time.monotonic() < end:
+        time.sleep(0.2)
+    assert b"val/mIoU" in log.read_bytes()
 
 
 @pytest.mark.slow
