@@ -35,6 +35,8 @@ _CERTAIN = 2.5  # values within so many times their error need none either
 # least half width of an interval: scans are not corrected for motion exactly, nor interpolated
 _SYSTEMATIC = np.array([0.08, 0.08, 0.08, *np.deg2rad([0.1, 0.1, 0.1]), 0.01])
 _GROUP, _GROUPS = 30, 3  # most scans whose errors are related, and least groups of them
+# Poses drift if what remains grows so many times over seconds, to so many least deviations.
+_GROWS, _MUCH = 1.5, 5.0
 _EXPLAINED = 3.0  # least variance that a value explains, in variances of what remains
 _LIMITS = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5, 2.0])  # greatest values
 _NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "late")
@@ -140,13 +142,16 @@ def find_mounting(
     more = max(len(sums) - 1, 1)
     spread = inverse @ (sums.T @ sums) @ inverse * (more + 1) / more
     apart = (2.0 + 3.0 / more + 3.0 / more**2) * np.sqrt(np.diag(spread))
-    errors = np.maximum(np.maximum(2.0 * np.sqrt(_SAME * np.diag(inverse)), apart), _SYSTEMATIC)
     # A value that moves the sensor little against what remains after seconds is not named: drift
     # and distortion explain as much.
     spans = np.concatenate([part.at[:, 1] - part.at[:, 0] for part in parts])
     longest = spans > 0.75 * spans.max()
     left = np.square(1.4826 * np.median(np.abs(scaled[longest]), axis=0))
     explained = (np.square(slope[longest] * values).mean(axis=0) / left[:, None]).max(axis=0)
+    errors = np.maximum(np.maximum(2.0 * np.sqrt(_SAME * np.diag(inverse)), apart), _SYSTEMATIC)
+    off_by = np.median(np.sqrt(left) * scale / _LEAST)
+    if np.median(left) > _GROWS and off_by > _MUCH:  # drift, of which no interval is known
+        errors[:] = np.inf
     unsure = (explained < _EXPLAINED) & (np.abs(values) > errors)
     return Mounting(values, np.where(unsure, np.inf, errors))
 
