@@ -209,6 +209,8 @@ def print_frames(result: Any, places: Iterable[object], done: str, *, json: bool
             echo(as_typed(f"note: {note}"))
         for place in places:
             echo(place)
+        if uses := getattr(result, "source_classes", ()):
+            echo(f"classes: {', '.join(map(str, uses))}")
         what, _, verb = done.rpartition(": ")
         skipped = f" ({result.skipped} existed)" if result.skipped else ""
         echo(

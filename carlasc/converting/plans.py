@@ -259,6 +259,10 @@ def examine(
     notes, findings = list[str | None](), list[Finding]()
     checked = recording.rays and (level or not known)
     mount = find_mount(_some_scans(recording)) if checked else None
+    if level and mount is None:
+        raise FormatError(
+            recording.location, expected="ground in the scans, to turn them upright", found="none"
+        )
     if level and mount is not None:
         recording = _upright(recording, converter, mount, options)
         notes.append(f"scans were turned upright: they show {mount}")
@@ -311,7 +315,16 @@ def examine(
             try:
                 notes.append(check_poses(recording, converter, poses))
             except FormatError as error:
-                findings.append(Finding.from_error("poses-on-scans", recording.location, error))
+                swapped = None if trajectory is None else _swapped(trajectory)
+                try:
+                    if swapped is None:
+                        raise
+                    other = scan_poses(swapped, recording, times)[:last]
+                    notes.append(check_poses(recording, converter, other))
+                    notes.append(f"quaternions in {swapped.where} are w, x, y, z: scans overlap so")
+                    trajectory, poses = swapped, other
+                except FormatError:
+                    findings.append(Finding.from_error("poses-on-scans", recording.location, error))
         numbers = np.array([handle.number for handle in chosen])
         if jump := describe_jumps(numbers, poses[numbers], times[numbers]):
             advice = f"check whether the poses belong to these scans, or {_ESTIMATE}"
@@ -326,6 +339,13 @@ def examine(
     return Examined(
         recording, times, own_times is not None, trajectory, poses, mount, said, findings
     )
+
+
+def _swapped(given: Trajectory) -> Trajectory | None:
+    """Return the poses with the other order of quaternions; None if the order is certain."""
+    if given.other is None:
+        return None
+    return replace(given, world_T_vehicle=given.other, other=None)
 
 
 def _ranges(numbers: IntArray) -> str:
@@ -442,9 +462,6 @@ def plan_recording(
             plan.missing.add(handle.number)
         if not writer.has("points", handle.number) or not _finished(plan, handle.number):
             plan.unfinished.add(handle.number)
-    if 0 < len(plan.unfinished) < (every := len(recording.frames)):
-        existing = every - len(plan.unfinished)
-        plan.notes.append(f"an earlier run was continued: {existing} of {every} frames existed")
     return plan
 
 

@@ -608,7 +608,9 @@ class Conversion:
 
     def _remarks(self) -> list[str]:
         plan = self.plan
-        notes = [*plan.recording.notes(), *plan.notes]
+        notes, every = [*plan.recording.notes(), *plan.notes], len(plan.recording.frames)
+        if 0 < (existing := every - len(plan.unfinished)) < every:
+            notes.append(f"an earlier run was continued: {existing} of {every} frames existed")
         if self.waits:
             notes.append("its grids wait, too, until all frames are converted")
         unlabelled = sum(not handle.labelled for handle in plan.recording.frames)

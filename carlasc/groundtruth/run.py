@@ -22,7 +22,7 @@ import numpy as np
 from carlasc.captures.raw import RAW, Capture, find_captures
 from carlasc.core.arrays import AnyArray
 from carlasc.core.choices import CompareInputs
-from carlasc.core.classes import ClassTable
+from carlasc.core.classes import ClassTable, TableUse
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import Grid, GridSpec, is_confident
 from carlasc.errors import (
@@ -40,7 +40,13 @@ from carlasc.groundtruth.comparing import InputCheck
 from carlasc.groundtruth.from_capture import capture_sequences
 from carlasc.groundtruth.from_grid import resampled_sequences
 from carlasc.groundtruth.from_scans.sequences import scan_sequences
-from carlasc.groundtruth.inputs import FrameData, FrameInput, GridPlan, SequenceInput
+from carlasc.groundtruth.inputs import (
+    FrameData,
+    FrameInput,
+    GridPlan,
+    SequenceInput,
+    StoredSequence,
+)
 from carlasc.groundtruth.options import FromCapture, FromScans, Observe, Voting
 from carlasc.groundtruth.reporting import Changes, FrameFacts, Report, sample_frames
 from carlasc.groundtruth.seen import check_views, see_voxels
@@ -81,6 +87,7 @@ class RegridResult:
         failures: frames that could not be made.
         elapsed_s: duration of the run, in seconds.
         notes: remarks about how the grids were made, one line each.
+        source_classes: class tables by which sequences were read, and what named them.
     """
 
     grids: tuple[str, ...]
@@ -90,6 +97,7 @@ class RegridResult:
     failures: tuple[FrameFailure, ...]
     elapsed_s: float
     notes: tuple[str, ...] = ()
+    source_classes: tuple[TableUse, ...] = ()
 
 
 def regrid(
@@ -181,10 +189,10 @@ def regrid(
 
     grids = tuple(sink.place(f"{job.path}/{grid}") for job in jobs)
     notes = tuple(note for job in jobs for note in (*job.check.notes, *job.inputs.notes()))
-    made = work.wanted - len(failures)
-    return RegridResult(
-        grids, spec, made, work.skipped, tuple(failures), time.perf_counter() - start, notes
-    )
+    made, took = work.wanted - len(failures), time.perf_counter() - start
+    stored = [job.inputs.sequence for job in jobs if isinstance(job.inputs, StoredSequence)]
+    uses = tuple(sorted({sequence.table_use() for sequence in stored}))
+    return RegridResult(grids, spec, made, work.skipped, tuple(failures), took, notes, uses)
 
 
 def _choose(source: AnyPath | Source | Capture) -> Observe:

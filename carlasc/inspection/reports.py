@@ -221,7 +221,11 @@ def inputs_of(sequence: Sequence, grid: str) -> ScanSequence | None:
         if known.get("observe") != "scans":
             return None
         options = _options_of(known)
-        voting = Voting(known.get("voting"), float(known.get("free_step_m", Voting().free_step_m)))
+        voting = Voting(
+            known.get("voting"),
+            float(known.get("free_step_m", Voting().free_step_m)),
+            min_confidence=float(known.get("min_confidence", 0.0)),
+        )
         plan = GridPlan(sequence.grids[grid], grid, options, voting, FrameRange.of(None))
         inputs = ScanSequence(sequence, plan, options)
         return inputs if len(inputs.feed.frames) else None

@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 
 from carlasc.core.arrays import AnyArray, BoolArray, FloatArray, IntArray, LabelArray
-from carlasc.core.classes import ClassTable, TableUse, times
+from carlasc.core.classes import ClassTable, TableUse, tables_with, times
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLASC11, table_to_json
 from carlasc.errors import FormatError, MissingDataError, load_plugin, plugin_names
@@ -397,8 +397,14 @@ class VoxelSequence(Sequence):
         """Return the same files, read with another class table."""
         frames_of = {name: copy.copy(frames) for name, frames in self.frames_of.items()}
         for frames in frames_of.values():
-            frames.classes, frames.named = classes, "option"
+            frames.classes, frames.named = classes, "option"  # with the ids of the files
         return VoxelSequence(self.path, frames_of)
+
+    def follow(self, grid: str, truth: Sequence, truth_grid: str) -> None:
+        """Take the numbers of frames, which are named by tokens, from the ground truth."""
+        if isinstance(truth, VoxelSequence):
+            self.frames_of[grid].follow(truth.frames_of[truth_grid])
+            vars(self).pop("_fields", None)
 
     @cached_property
     def metadata(self) -> Metadata:
@@ -460,7 +466,16 @@ class VoxelSequence(Sequence):
             return counted.astype(np.float32)
         labels = np.where(counted, labels, table.free)
         if unknown := table.unknown(labels):
-            raise FormatError(where, expected=f"class ids of {table.name}", found=times(unknown))
+            names = [one.name for one in tables_with(np.unique(labels).tolist(), table)]
+            best = grid.benchmark if grid.benchmark in names else next(iter(names), None)
+            raise FormatError(
+                where,
+                expected=f"class ids of {table.name}",
+                found=times(unknown),
+                advice=f"if they are ids of {best}, give `source_classes={best}`"
+                if best
+                else "correct the labels, or name their table with `source_classes`",
+            )
         swap = np.arange(max(table.names) + 1, dtype=table.dtype)
         swap[[0, table.free]] = table.free, 0
         return swap[labels]

@@ -121,6 +121,8 @@ class Scene:
         reference = None
         if truth is not None:
             reference = RemappedSequence(truth.sequence, choose_grid(truth, self.truth_grid))
+            if isinstance(part.sequence, VoxelSequence) and grid:
+                part.sequence.follow(grid, truth.sequence, reference.grid)
             if "errors" in contents:
                 check_same_geometry(data.spec, reference.spec)
         table = common_table(data, reference, table_of(self.classes))

@@ -231,4 +231,5 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
 def write_all(root: Path) -> None:
     """Write a folder of each format."""
     for name, writer in WRITERS.items():
-        writer(root / name)
+        if not (root / name).exists():
+            writer(root / name)

@@ -287,3 +287,17 @@ def test_rays_start_at_the_sensor_of_the_format(name, tmp_path):
 def test_a_table_given_as_an_object_is_taken(town):
     table = ClassTable("carla", CARLA.names, CARLA.colors)
     assert evaluate(town[0], town[0], source_classes=table).miou == 1.0
+
+
+def test_the_table_of_any_labels_can_be_named_when_they_are_counted(tmp_path):
+    write_ground(tmp_path, 24)
+    counted = stats(tmp_path, source_classes="carla0.9.14")
+    assert counted.failures == () and counted.uses[0].found == "option"
+    assert counted.named(counted.total.points)["RoadLine"] > 0
+    raws = np.array([*SSCBENCH_TO_RAW.values()])
+    truth = np.random.default_rng(3).integers(0, len(raws), (256, 256, 32))
+    write_kitti_pair(tmp_path / "k", raws[truth], truth, "data_2d_raw/a_sync")
+    (message,) = [message for _, message in stats(tmp_path / "k/pred").failures]
+    option = re.search(r"`source_classes=(\S+)`", message)[1]
+    named = stats(tmp_path / "k/pred", source_classes=option)
+    assert named.total.voxels[1] == (truth == 1).sum() and option == "sscbench"

@@ -42,7 +42,7 @@ from carlasc_converters.exporters.submission import (
     pack_submission,
 )
 from carlasc_converters.kitti import CLASS_PARTS
-from carlasc_converters.kitti_voxels import MASKS, pack_bits
+from carlasc_converters.kitti_voxels import GRID, MASKS, pack_bits
 
 _NAMES_OF_11 = (
     "unlabeled building fence other-object person pole road other-ground sidewalk vegetation car"
@@ -170,6 +170,12 @@ class KittiExporter(FrameExporter):
         if sequence.grids or self.grid or self.predictions:
             name = self._grid_of(sequence)
             self._mapping(sequence.classes_of(name), f"{sequence.location}/{name}")
+            spec = sequence.grids[name]
+            if spec.size != GRID.size:
+                return [
+                    f"{sequence.location}/{name} is {spec}; programs for SemanticKITTI read only "
+                    f"voxels of {GRID}"
+                ]
         return []
 
     def frames(self, sequence: storage.Sequence) -> list[int]:
