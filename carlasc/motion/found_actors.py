@@ -13,7 +13,7 @@ import numpy as np
 
 from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
-from carlasc.motion.evidence import OWN_CELL_M, FreeSpaceEvidence, cells_around
+from carlasc.motion.evidence import OWN_CELL_M, OWN_REACH_M, FreeSpaceEvidence, cells_around
 from carlasc.motion.paths import estimate_path, is_static, middles_of, misalignment
 from carlasc.motion.planes import nearest_points
 from carlasc.motion.segments import Segment
@@ -100,6 +100,7 @@ class ActorFollower:
         self._near, self._freed = Counter[_Cell](), Counter[_Cell]()
         self._cells: dict[int, Counter[_Cell]] = {}
         self._poses: list[Transform] = []
+        self._close: list[tuple[int, IntArray, list[_Cell]]] = []
         self._deformable, self._label, self._number = deformable, default_label, first_instance
         self._alive: list[_ActorChain] = []
 
@@ -110,9 +111,12 @@ class ActorFollower:
         self.moved[scan.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
         self._poses.append(scan.world_T_sensor)
         self._near.update(_cells(scan.near))
-        for points in scan.points:
+        for members, points in zip(scan.clusters, scan.points, strict=True):
             local = transform_points(invert(scan.world_T_sensor), points)
-            self._freed.update(_cells(cells_around(local)))
+            cells = _cells(cells_around(local))
+            self._freed.update(cells)
+            if cells and np.abs(local).max() < OWN_REACH_M:
+                self._close.append((scan.frame, members, cells))
         before, self._alive = self._alive, []
         ended = list[_ActorChain]()
         for one in before:
@@ -131,7 +135,11 @@ class ActorFollower:
             if inside > _OWN_SHARE * cells.total():
                 self.riders.add(number)
         lower = np.array(sorted(own), np.float64).reshape(-1, 3) * OWN_CELL_M
-        self.own = list(np.hstack([lower - OWN_CELL_M / 2, lower + 1.5 * OWN_CELL_M]))
+        self.own = list(np.hstack([lower - OWN_CELL_M, lower + 2 * OWN_CELL_M]))
+        wide = {beside for cell in own for beside in _around(cell)}
+        for frame, members, close in self._close:
+            if wide.issuperset(close):  # found by their place
+                self.moved[frame] = np.setdiff1d(self.moved[frame], members)
         return [actor for actor in actors if actor.segments[0].instance not in self.riders]
 
     def _own_cells(self) -> set[_Cell]:
@@ -153,9 +161,7 @@ class ActorFollower:
         }
         waiting = list(own)
         while waiting:
-            i, j, k = waiting.pop()
-            for di, dj, dk in np.ndindex(3, 3, 3):
-                beside = (i + di - 1, j + dj - 1, k + dk - 1)
+            for beside in _around(waiting.pop()):
                 if beside not in own and self._freed[beside] >= _OFTEN * scans:
                     own.add(beside)
                     waiting.append(beside)
@@ -391,6 +397,12 @@ class _ActorChain:
         return bool(
             np.ptp(np.quantile(z / np.maximum(np.hypot(x, y), 1e-3), (0.05, 0.95))) < _LINE_SLOPE
         )
+
+
+def _around(cell: _Cell) -> list[_Cell]:
+    """Return a cell and those beside it."""
+    x, y, z = cell
+    return [(x + i - 1, y + j - 1, z + k - 1) for i, j, k in np.ndindex(3, 3, 3)]
 
 
 def _cells(cells: IntArray) -> list[_Cell]:

@@ -153,7 +153,7 @@ def test_no_ground_is_no_height():
         (COARSE, 13.0, COARSE.size, 25.6),
         (COARSE.with_resolution(0.2), 5.0, (64, 64, 15), 6.4),
         (GridSpec.published("fine"), 5.0, (256, 256, 16), 25.6),
-        (GridSpec.published("cylindrical"), 5.0, (128, 128, 8), 25.6),
+        (GridSpec.published("cylindrical"), 5.0, (128, 128, 8), 30.0),
     ],
 )
 def test_grids_fit_the_reach_of_the_points_of_a_room(spec, reach_m, size, side_m):
