@@ -59,6 +59,8 @@ class LayoutOptions:
             written. "none": left out. The calibration of the cameras is always written.
         level: turn scans upright, so that the ground in them is level: for a LiDAR that is mounted
             upside down or at an angle, without a calibration that says so.
+        allow_gaps: finish frames that take labels, motion or votes from a frame that failed.
+            Otherwise they wait until it is repaired.
 
     Raises:
         ArgumentError: an unknown value of `axes`, `flow` or `images`.
@@ -70,6 +72,7 @@ class LayoutOptions:
     allow_unknown: bool = False
     images: Images = "none"
     level: bool = False
+    allow_gaps: bool = False
 
     def __post_init__(self) -> None:
         check_types(LayoutOptions, vars(self))

@@ -574,7 +574,9 @@ def begin(plan: RecordingPlan, target: AxesAndClasses, metadata: Metadata) -> No
     documents = {layout.METADATA: agree_metadata(writer, described)}
     if plan.again and existing is not None:
         documents[layout.METADATA] = described.to_json()
-    documents[layout.TIMES] = agree_lines(writer, layout.TIMES, plan.times - plan.times[0])
+    documents[layout.TIMES] = agree_lines(
+        writer, layout.TIMES, plan.times - plan.times[0], is_whole=plan.again
+    )
     if plan.voxels is not None:
         documents[layout.params_file(layout.grid_folder(plan.voxels))] = to_json(
             _voxel_params(plan.voxels, target)
@@ -600,7 +602,9 @@ def write_poses(plan: RecordingPlan, target: AxesAndClasses) -> None:
     if plan.again and plan.pose_source == KISS_ICP:
         _write(plan, {layout.POSES: layout.encode_poses(poses)})
     else:
-        _write(plan, {layout.POSES: agree_lines(plan.writer, layout.POSES, poses)})
+        _write(
+            plan, {layout.POSES: agree_lines(plan.writer, layout.POSES, poses, is_whole=plan.again)}
+        )
 
 
 def _places(extra: Mapping[str, Any]) -> list[object]:

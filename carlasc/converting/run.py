@@ -83,7 +83,6 @@ def convert(
     grids: Grids = GridOptions(),  # noqa: B008 (frozen)
     options: Mapping[str, Any] | None = None,
     compare_inputs: CompareInputs = "fast",
-    allow_gaps: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> ConvertResult:
     """Write another data set as sequences of the CarlaSC layout: the same files, axes and classes;
@@ -114,8 +113,6 @@ def convert(
         compare_inputs: how it is found out whether the data set changed: "fast": by the names,
             sizes and times of its files; "content": all frames are made again and compared;
             "never": existing frames are kept.
-        allow_gaps: finish frames that take labels, motion or votes from a frame that failed.
-            Otherwise they wait until it is repaired.
         run: how the work is spread. A part converts whole recordings, because poses and motion are
             estimated along each of them. Grids then keep their height, because the ground of the
             other recordings is not known.
@@ -172,7 +169,7 @@ def convert(
     steps = StepCounter(run.progress, every + in_grids)
     with one_pool(run) as pooled:
         conversions = [
-            Conversion(plan, converter, target, layout.images, pooled, steps, allow_gaps)
+            Conversion(plan, converter, target, layout.images, pooled, steps, layout.allow_gaps)
             for plan in plans
         ]
         with ExitStack() as writers:

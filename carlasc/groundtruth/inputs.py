@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any, get_args
 from carlasc.core.arrays import AnyArray, FloatArray, IntArray, Uint8Array
 from carlasc.core.frames import FrameRange
 from carlasc.core.grids import Grid, GridSpec
-from carlasc.core.tables import table_to_json
 from carlasc.errors import ArgumentError, CarlascError, MissingDataError
 from carlasc.groundtruth.options import FromGrid, FromScans, Observe, Voting
 from carlasc.groundtruth.reporting import PoseFacts, Residual
@@ -290,7 +289,7 @@ class SequenceInput(ABC):
 
     def shared(self) -> object:
         """Return what all frames depend on, besides the settings in params.json."""
-        return table_to_json(self.metadata.classes), self.cameras()
+        return self.metadata.classes.to_dict(), self.cameras()
 
     def available(self) -> Collection[int]:
         """Return the numbers of all frames that the source can have in the output."""

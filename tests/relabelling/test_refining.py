@@ -18,7 +18,13 @@ import carlasc
 from carlasc import GridSpec, Run
 from carlasc.captures import Lidar
 from carlasc.core.geometry import invert, multiply, slerp, translation
-from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
+from carlasc.errors import (
+    ArgumentError,
+    CompleteError,
+    ConflictError,
+    FormatError,
+    MissingDataError,
+)
 from carlasc.inspection import validate
 from carlasc.motion import PoseOptions
 from carlasc.relabelling import refining
@@ -41,7 +47,7 @@ def files_of(folder):
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in folder.rglob("*")
-        if path.is_file()
+        if path.is_file() and ".carlasc" not in path.parts
     }
 
 
@@ -233,8 +239,10 @@ def test_too_few_scans_are_left_alone_and_sequences_without_scans_are_left_out(e
 
 def test_what_exists_is_not_replaced_unless_it_was_refined_and_that_is_asked_for(data, tmp_path):
     carlasc.refine(data, tmp_path / "out", run=ALONE)
-    with pytest.raises(ConflictError) as error:
+    with pytest.raises(CompleteError):
         carlasc.refine(data, tmp_path / "out", run=ALONE)
+    with pytest.raises(ConflictError) as error:
+        carlasc.refine(data, tmp_path / "out", poses=PoseOptions(refine="always"), run=ALONE)
     assert error.value.expected == "a new path"
     carlasc.refine(
         data, tmp_path / "out", poses=PoseOptions(refine="always"), overwrite=True, run=ALONE
