@@ -190,6 +190,13 @@ class ConflictError(CarlascError):
     """Writing would destroy existing data, or mix with them."""
 
 
+class CompleteError(ConflictError):
+    """The output exists, whole, and was made with the same options from the same input.
+
+    Commands say so and exit with 0.
+    """
+
+
 class StorageError(CarlascError):
     """The output cannot be written: a full disk, a folder without write permission.
 

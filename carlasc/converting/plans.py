@@ -101,6 +101,7 @@ class RecordingPlan(Examined):
         flow: whether flow is written.
         voxels: geometry of the recording's own voxel grids, right-handed, if they are written.
         force: whether estimated poses are not checked.
+        voxel_m: size of the voxels of the odometry; None: by the distances of points.
         missing: numbers of the frames whose scan is not written yet.
         unfinished: numbers of the frames without a scan, or without the fields from the motion of
             actors.
@@ -114,6 +115,7 @@ class RecordingPlan(Examined):
     flow: bool
     voxels: GridSpec | None = None
     force: bool = False
+    voxel_m: float | None = None
     missing: set[int] = field(default_factory=set)
     unfinished: set[int] = field(default_factory=set)
     again: bool = False
@@ -257,6 +259,10 @@ def examine(
     notes, findings = list[str | None](), list[Finding]()
     checked = recording.rays and (level or not known)
     mount = find_mount(_some_scans(recording)) if checked else None
+    if level and mount is None:
+        raise FormatError(
+            recording.location, expected="ground in the scans, to turn them upright", found="none"
+        )
     if level and mount is not None:
         recording = _upright(recording, converter, mount, options)
         notes.append(f"scans were turned upright: they show {mount}")
@@ -309,7 +315,16 @@ def examine(
             try:
                 notes.append(check_poses(recording, converter, poses))
             except FormatError as error:
-                findings.append(Finding.from_error("poses-on-scans", recording.location, error))
+                swapped = None if trajectory is None else _swapped(trajectory)
+                try:
+                    if swapped is None:
+                        raise
+                    other = scan_poses(swapped, recording, times)[:last]
+                    notes.append(check_poses(recording, converter, other))
+                    notes.append(f"quaternions in {swapped.where} are w, x, y, z: scans overlap so")
+                    trajectory, poses = swapped, other
+                except FormatError:
+                    findings.append(Finding.from_error("poses-on-scans", recording.location, error))
         numbers = np.array([handle.number for handle in chosen])
         if jump := describe_jumps(numbers, poses[numbers], times[numbers]):
             advice = f"check whether the poses belong to these scans, or {_ESTIMATE}"
@@ -324,6 +339,13 @@ def examine(
     return Examined(
         recording, times, own_times is not None, trajectory, poses, mount, said, findings
     )
+
+
+def _swapped(given: Trajectory) -> Trajectory | None:
+    """Return the poses with the other order of quaternions; None if the order is certain."""
+    if given.other is None:
+        return None
+    return replace(given, world_T_vehicle=given.other, other=None)
 
 
 def _ranges(numbers: IntArray) -> str:
@@ -433,15 +455,13 @@ def plan_recording(
         flow=flow and (boxes is not None or (recording.has_labels and recording.has_instances)),
         voxels=_check_voxels(recording, writer, target) if voxels else None,
         force=options.force,
+        voxel_m=options.odometry_voxel_m,
     )
     for handle in recording.frames:
         if not writer.has("points", handle.number):
             plan.missing.add(handle.number)
         if not writer.has("points", handle.number) or not _finished(plan, handle.number):
             plan.unfinished.add(handle.number)
-    if 0 < len(plan.unfinished) < (every := len(recording.frames)):
-        existing = every - len(plan.unfinished)
-        plan.notes.append(f"an earlier run was continued: {existing} of {every} frames existed")
     return plan
 
 
@@ -780,14 +800,9 @@ class _ReadUsable:
 
 
 def estimate_poses(
-    recording: Recording,
-    converter: Converter,
-    times: FloatArray,
-    step: Callable[[], object],
-    run: Run,
-    checked: str | None,
+    plan: RecordingPlan, converter: Converter, step: Callable[[], object], run: Run
 ) -> FloatArray:
-    """Estimate the pose of each scan with KISS-ICP.
+    """Estimate the pose of each scan with odometry.
 
     A frame without a scan gets the pose of the scan before it.
 
@@ -796,12 +811,10 @@ def estimate_poses(
     scans with too few points.
 
     Args:
-        recording: its scans.
+        plan: its scans, and how their poses are estimated.
         converter: the converter, for the range of points to use.
-        times: (F,) seconds by frame number.
         step: called for each frame.
         run: how the reading of scans is spread.
-        checked: the recording, for errors; None if the poses are accepted without a check.
 
     Returns:
         (F, 4, 4) first_T_scan by frame number, right-handed.
@@ -811,11 +824,11 @@ def estimate_poses(
         MissingDataError: no scan has enough points.
         DependencyError: kiss-icp is not installed.
     """
-    rig = Rig.of(recording)
+    recording = plan.recording
     errors: list[CarlascError | OSError] = []
 
     def scans() -> Iterator[tuple[int, UsableScan]]:
-        with closing(run_all(_ReadUsable(rig), recording.frames, run)) as read:
+        with closing(run_all(_ReadUsable(plan.rig), recording.frames, run)) as read:
             for handle, scan in zip(recording.frames, read, strict=True):
                 step()
                 if isinstance(scan, Exception):
@@ -823,26 +836,22 @@ def estimate_poses(
                 else:
                     yield handle.number, scan
 
-    poses = dict(follow(scans(), converter, times, checked))
+    poses = dict(follow(scans(), converter, plan))
     if len(errors) == len(recording.frames):
         raise errors[0]
     return fill_gaps(poses, recording)
 
 
 def follow(
-    scans: Iterable[tuple[int, UsableScan]],
-    converter: Converter,
-    times: FloatArray,
-    checked: str | None,
+    scans: Iterable[tuple[int, UsableScan]], converter: Converter, plan: RecordingPlan
 ) -> Iterator[tuple[int, FloatArray]]:
     """Yield the frame number and the (4, 4) first_T_scan of each scan with enough points, estimated
-    with KISS-ICP.
+    with odometry.
 
     Args:
         scans: frame numbers and scans, in order.
         converter: the converter, for the range of points to use.
-        times: (F,) seconds by frame number.
-        checked: the recording, for errors; None if the poses are accepted without a check.
+        plan: how poses are estimated; gets a note on what was chosen.
 
     Raises:
         DependencyError: kiss-icp is not installed.
@@ -858,7 +867,7 @@ def follow(
         for number, scan in scans:
             if len(scan[0]) >= odometry.MIN_POINTS:
                 numbers.append(number)
-                read_at.append(float(times[number]))
+                read_at.append(float(plan.times[number]))
                 centres.add(scan[0])
                 yield scan
 
@@ -868,12 +877,14 @@ def follow(
             times=read_at,
             min_range_m=converter.min_range_m or 0.0,
             max_range_m=converter.max_range_m or 100.0,
+            voxel_m=plan.voxel_m,
+            note=plan.notes.append,
         )
     ):
         poses.append(pose)
         yield numbers[index], pose
-    if poses and checked is not None:
-        centres.check(np.stack(poses), checked)
+    if poses and plan.checked is not None:
+        centres.check(np.stack(poses), plan.checked)
 
 
 def fill_gaps(poses: Mapping[int, FloatArray], recording: Recording) -> FloatArray:

@@ -22,11 +22,12 @@ _ENOUGH = 30000  # points of a scan in which the ground is looked for
 _SAMPLE = 4000  # points of a scan that say how far away they are
 # no LiDAR on a carrier sees half of its points, or all of them, so far away
 _FARTHEST_M, _ALL_FAR_M = 2000.0, 250.0
-_LONGEST_S = 3.0  # points are taken within this time of their frame
+_LONGEST_S = 3.0  # points are taken within this time of their frame; fact: longest-frame
 
-POSE_S = 0.25
+POSE_S = 0.25  # fact: pose-reach
 """Scans this near in time to the first or the last pose get a pose."""
-_GAP_S, _USUAL_GAPS = 1.0, 5.0  # poses are interpolated over this time, or so many usual intervals
+_GAP_S = 1.0  # poses are interpolated over this time; fact: pose-gap
+_USUAL_GAPS = 5.0  # or over so many usual intervals
 
 # Up in the axes of the sensor, the most likely first, and the axes that it belongs to.
 _UPS = (("+z", "flu"), ("-z", "frd"), ("-y", "rdf"), ("+y", "rub"), ("+x", "ulb"), ("-x", "dlf"))

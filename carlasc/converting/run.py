@@ -24,7 +24,7 @@ from carlasc.core.choices import CompareInputs
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError, check_choice, check_types
-from carlasc.groundtruth.options import FromScans, GridOptions, Voting, fit_to_ground
+from carlasc.groundtruth.options import FromScans, GridOptions, Voting, fit_to_ground, fit_to_reach
 from carlasc.groundtruth.run import regrid
 from carlasc.inspection.findings import Finding
 from carlasc.motion.ground import Ground, joined
@@ -243,13 +243,20 @@ def _plan_grids(
     """Return the grid of the converted sequences, how scans are merged, and notes for the user.
 
     All grids have the same bounds, so that they can be in one training set: the bounds of the
-    options, moved to the height of the ground if `follow_ground` is set.
+    options, fitted to the ground and to the reach of points if `follow_ground` is set.
     """
     spec, notes = grids.spec or GridSpec.published(), list[str]()
     if grids.follow_ground:
-        spec, notes = _fit(
-            spec, [one.ground for one in conversions if one.ground is not None], scans.location
-        )
+        reach_m = max(one.reach_m for one in conversions)
+        whole, spec = spec, fit_to_reach(spec, reach_m)
+        grounds = [one.ground for one in conversions if one.ground is not None]
+        spec, notes = _fit(spec, grounds, scans.location)
+        if spec.upper[0] != whole.upper[0]:
+            notes.append(
+                f"{scans.location}: nearly all points are within {reach_m:.1f} m, so grids reach "
+                f"{spec.upper[0]:g} m instead of {whole.upper[0]:g} m to each side, with voxels of "
+                f"{spec.voxel_size[0]:.2g} m; give --bounds to keep them"
+            )
     observe = replace(
         grids.observe if isinstance(grids.observe, FromScans) else FromScans(),
         poses=replace(poses, source="file"),

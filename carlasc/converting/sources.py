@@ -18,7 +18,14 @@ from carlasc.converting.plans import KISS_ICP, RecordingPlan
 from carlasc.converting.protocol import Recording
 from carlasc.converting.stages import Conversion
 from carlasc.core.choices import CompareInputs
-from carlasc.storage.inputs import MadeFrom, changed_names, combined, folder_states, made_again
+from carlasc.storage.inputs import (
+    UNKNOWN,
+    MadeFrom,
+    changed_names,
+    combined,
+    folder_states,
+    made_again,
+)
 
 _NAME = "conversion"
 # the states of frames; others were finished without a frame that is a gap
@@ -112,8 +119,11 @@ class SourceFiles:
         exists = len(plan.missing) < len(plan.recording.frames)
         record = ConversionRecord(plan, before, states)
         is_other = before.own != states or _GAP in before.frames.values()
-        if exists and (is_other or self.compare == "content"):
+        if exists and (self.compare == "content" or (before.whole and is_other)):
             plan.make_again()
+        elif exists and not before.whole:
+            record.states = None
+            record.notes.append(f"{plan.writer.location}: {UNKNOWN}")
         else:
             record.write()
         return record

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.arrays import (
+    AnyArray,
     BoolArray,
     Float32Array,
     FloatArray,
@@ -130,7 +131,8 @@ def collate_sparse(samples: Sequence[Mapping[str, object]]) -> dict[str, Any]:
     if not names:
         expected = f"samples with {', '.join(sorted(STACKS))}"
         raise ArgumentError("samples", expected=expected, found="none of them")
-    indices, features = [], []
+    indices: list[AnyArray] = []
+    features: list[AnyArray] = []
     for number, sample in enumerate(given):
         stacks = np.concatenate([sample.pop(name) for name in names])
         cells = np.argwhere(stacks.any(axis=0)).astype(np.int32)

@@ -376,7 +376,8 @@ class Dataset(_MapStyle):
         plain.fields = (field, *({"known"} & set(self.fields) if field == "labels" else ()))
         plain._grid_fields = replace(self._grid_fields, fields=frozenset(plain.fields))
         counts = np.zeros((len(self), channels), np.int64)
-        for number, sample in enumerate(plain):
+        for number in range(len(self)):
+            sample = cast(Values, plain[number])
             labels = sample[field]
             known = labels[sample.get("known", ...)].ravel()
             counts[number] = np.bincount(known, minlength=channels)

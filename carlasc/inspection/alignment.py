@@ -26,7 +26,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import CarlascError
 from carlasc.inspection.points_in_voxels import warped_voxels
 from carlasc.inspection.pose_quality import PoseQuality, angles_of, measure_poses
-from carlasc.motion.joint_alignment import AlignmentPass, blocks, spread_of
+from carlasc.motion.joint_alignment import blocks, spread_of
 from carlasc.motion.solving import principal_axes
 from carlasc.storage.protocol import Sequence
 
@@ -316,8 +316,8 @@ _LONG_PAIRS = 12
 # Scans over this distance overlap by at least a share, or by as much of the share of neighbours:
 # where a motion is missing in the poses, they do not.
 _LEAST, _ALIKE, _ENOUGH = 0.25, 0.62, 0.5
-_WALL = AlignmentPass(1.0, 1, 0.06, 0.02)  # surfaces of one scan: cells, thickness
-_WALL_POINTS, _WIDE_M2, _SURFACE_M = 12, 0.02, 50.0
+# surfaces of one scan: size of the cells, least points, thickness, flatness, width, range
+_WALL_M, _WALL_POINTS, _THIN_M2, _FLAT, _WIDE_M2, _SURFACE_M = 1.0, 12, 0.06**2, 0.02, 0.02, 50.0
 _OPEN = 0.003  # share of the surfaces that face a direction, below which none determines it
 
 
@@ -369,15 +369,13 @@ def measure_overlap(
         target, moved = structure(first), _thin(structure(last), _OFFSET_POINTS)
         if min(len(target), len(moved)) >= _MIN_POINTS:
             shares.append(overlap(occupancy(target), relative(poses, first, last), moved))
-        own = points(first)
+        own, here = points(first), poses[first : first + 1]
         own = own[within(own, _INDOORS_M, _SURFACE_M)].astype(np.float32)
-        (block,) = blocks([own], poses[first : first + 1], _WALL.cell_m, shift=0.0)
-        alone = block.sums[:, 0] >= _WALL_POINTS
-        _, spread = spread_of(block, poses[first : first + 1], 1)
-        values, vectors = principal_axes(spread[alone])
-        flat = (values[:, 0] < np.minimum(_WALL.flat * values[:, 1], _WALL.thick_m**2)) & (
-            values[:, 1] > _WIDE_M2
-        )
+        (block,) = blocks([own], here, _WALL_M, shift=0.0)
+        _, spread = spread_of(block, here, 1)
+        values, vectors = principal_axes(spread[block.sums[:, 0] >= _WALL_POINTS])
+        thin, wide, _ = values.T
+        flat = (thin < np.minimum(_FLAT * wide, _THIN_M2)) & (wide > _WIDE_M2)
         normals = vectors[flat][:, :, 0]
         facing += normals.T @ normals
     ways, directions = np.linalg.eigh(facing[:2, :2])  # the ground determines the height

@@ -40,7 +40,6 @@ from carlasc.storage.protocol import Sequence, Source
 
 EVERY = 10
 """Default of `every`: every tenth scan is left out."""
-# fact: heldout-verdict
 _FREE, _PASSED, _SWEPT = 0.02, 0.35, 0.25  # greatest shares of grids that are right
 _RETURNS = 1000  # fewer returns within the grid tell nothing
 # a frame is measured if its window has this share of the scans of a whole window

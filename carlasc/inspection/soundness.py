@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Final
 
 import numpy as np
 
@@ -28,22 +28,30 @@ CHECKS = {
 """What a grid needs, and what data must show for it. `SequenceReport.checks` has those that apply
 to a sequence, and those that its converter recorded.
 """
-ACCEPTED = "accepted"
+ACCEPTED: Final = "accepted"
+_FRAMES = "move each scan to the frame of its sensor, and write the poses of the sensor"
+_UPRIGHT = "convert again with `--level`, or with the right axes or mount"
 
-_FAR_M, _FEW = 500.0, 1e-3  # no LiDAR sees farther; a greater share of such points is wrong
+# no LiDAR sees farther; a greater share of such points is wrong
+_FAR_M, _FEW = 500.0, 0.001  # fact: far-points
 _TILT = 0.16  # slope of the ground against the sensor, above which grids are tilted
 _STEEPEST = 0.8  # greatest slope that is looked for
 _ABOVE_M = -0.05  # ground that is higher than this below the sensor is above it
 _SEEN = 0.5  # ground must be found in this share of the scans
-_EMPTY = 0.1  # greatest share of grids without an occupied voxel
+_EMPTY = 0.1  # greatest share of grids without an occupied voxel; fact: empty-grids
 # Scans that move so far while their poses stand are in one frame, which they were moved to.
 _CENTRE_M, _STANDING = 3.0, 0.2
 
 
 @dataclass
 class ScanFacts:
-    """What the scans of a sequence show of their sensor, frame by frame."""
+    """What the scans and grids of a sequence show, frame by frame.
 
+    Attributes:
+        occupied: by grid, whether each frame has an occupied voxel.
+    """
+
+    occupied: dict[str, list[bool]] = field(default_factory=dict)
     _scans: int = 0
     _far: list[float] = field(default_factory=list)
     _planes: list[FloatArray | None] = field(default_factory=list)
@@ -59,32 +67,33 @@ class ScanFacts:
             self._planes.append(ground_plane(points, _STEEPEST) if plane is None else plane)
             self._centres.append(np.median(points[:, :2], axis=0).astype(np.float64))
 
+    def made(self, sequence: Sequence) -> list[str]:
+        """Return those of `CHECKS` that `findings` makes."""
+        of_scans = [RANGE, GROUND] if sequence.metadata.has_rays else [RANGE]
+        return [OCCUPIED] * bool(self.occupied) + of_scans * bool(self._scans)
+
     def findings(self, sequence: Sequence) -> Iterator[Finding]:
-        """Yield what is wrong with the ranges and the ground, or what they leave open."""
+        """Yield what is wrong with ranges, ground and grids, or what they leave open."""
+        for grid, occupied in self.occupied.items():
+            empty = occupied.count(False)
+            if empty > _EMPTY * len(occupied):
+                where, found = (
+                    f"{sequence.location}/{grid}",
+                    f"none in {empty} of {len(occupied)} frames",
+                )
+                expected, advice = CHECKS[OCCUPIED], "check the bounds of the grid"
+                yield Finding("warning", OCCUPIED, where, expected, found, advice)
         where = f"{sequence.location}/points"
         if not self._far:
             if self._scans:  # other checks report scans that cannot be read
                 yield untested(RANGE, where, "no scan that was read has points")
             return
         if (far := float(np.mean(self._far))) > _FEW:
-            yield Finding(
-                "error",
-                RANGE,
-                where,
-                f"points within {_FAR_M:g} m of the sensor",
-                f"{far:.1%} of the points beyond it",
-                "they are in a frame of the world, or belong to other times: convert again",
-            )
+            found = f"{far:.1%} of the points more than {_FAR_M:g} m away"
+            yield Finding("error", RANGE, where, CHECKS[RANGE], found, _FRAMES)
         elif self._is_moved(sequence):
-            yield Finding(
-                "error",
-                RANGE,
-                where,
-                "scans in the frame of their sensor",
-                "scans whose points move by metres while their poses stand",
-                "the scans are in one common frame: move each to the frame of its sensor, and "
-                "write the poses of the sensor",
-            )
+            found = "points that move by metres while the poses stand"
+            yield Finding("error", RANGE, where, CHECKS[RANGE], found, _FRAMES)
         if sequence.metadata.has_rays:
             yield from self._ground(where)
 
@@ -110,63 +119,27 @@ class ScanFacts:
         tilt = float(np.median(np.hypot(planes[:, 0], planes[:, 1])))
         if height > _ABOVE_M:
             found = f"ground {height:.2f} m above it: the sensor is upside down, or z points down"
-            yield Finding(
-                "error", GROUND, where, expected, found, "convert again, with the right axes"
-            )
+            yield Finding("error", GROUND, where, expected, found, _UPRIGHT)
         elif tilt > _TILT:
-            yield Finding(
-                "warning",
-                GROUND,
-                where,
-                expected,
-                f"ground that is tilted by {np.degrees(np.arctan(tilt)):.0f} degrees",
-                "convert again, with the mount of the sensor",
-            )
-
-
-def check_occupied(sequence: Sequence, grid: str, occupied: list[bool]) -> Iterator[Finding]:
-    """Yield a warning if many of the grids that were read have no occupied voxel."""
-    empty = occupied.count(False)
-    if empty > _EMPTY * len(occupied):
-        yield Finding(
-            "warning",
-            OCCUPIED,
-            f"{sequence.location}/{grid}",
-            CHECKS[OCCUPIED],
-            f"none in {empty} of {len(occupied)} frames",
-            "check whether the points lie within the bounds of the grid",
-        )
+            found = f"ground that is tilted by {np.degrees(np.arctan(tilt)):.0f} degrees"
+            yield Finding("warning", GROUND, where, expected, found, _UPRIGHT)
 
 
 def untested(check: str, where: str, why: str) -> Finding:
     """Return the finding of a check that could not be made."""
     found = f"data that could not be tested, because {why}"
-    advice = f"`--accept {check}` if this is true of the place"
-    return Finding("warning", check, where, CHECKS[check], found, advice, tested=False)
+    return Finding("warning", check, where, CHECKS[check], found, _accept(check), tested=False)
 
 
-def recorded(sequence: Sequence) -> Iterator[Finding]:
-    """Yield what carlasc.json says of a sequence: the warnings of its converter, and notes of what
-    was accepted.
-    """
-    where = f"{sequence.location}/{layout.METADATA}"
-    for one in _entries(sequence):
-        verdict, check = str(one.get("verdict")), str(one.get("check"))
-        if verdict in ("warning", "error", ACCEPTED):
-            yield Finding(
-                "note" if verdict == ACCEPTED else "warning",
-                check,
-                where,
-                "a recording without warnings",
-                f"{verdict}: {one.get('message')}",
-                "" if verdict == ACCEPTED else f"`--accept {check}` if this is true of the place",
-            )
+def _accept(check: str) -> str:
+    return f"`--accept {check}` if this is true of the place"
 
 
 def judge(
     sequence: Sequence, findings: Iterable[Finding], made: Collection[str], accept: Collection[str]
 ) -> tuple[list[Finding], dict[str, State]]:
-    """Return the findings, where accepted warnings are notes, and the state of each check.
+    """Return the findings, where accepted warnings are notes, with the warnings that the converter
+    recorded in carlasc.json; and the state of each check.
 
     Args:
         sequence: its record says what was accepted before.
@@ -175,20 +148,25 @@ def judge(
         accept: checks whose warnings are accepted now.
     """
     entries = _entries(sequence)
-    accepted = {*accept, *(one.get("check") for one in entries if one.get("verdict") == ACCEPTED)}
-    states: dict[str, State] = dict.fromkeys(made, "right")
-    of_record = {str(one.get("check")) for one in entries}
+    before = [check for check, (verdict, _) in entries.items() if verdict == ACCEPTED]
+    states: dict[str, State] = {**dict.fromkeys(made, "right"), **dict.fromkeys(before, ACCEPTED)}
+    where, expected = f"{sequence.location}/{layout.METADATA}", "a recording without warnings"
+    warned = [
+        Finding("warning", check, where, expected, message, _accept(check))
+        for check, (verdict, message) in entries.items()
+        if verdict in ("warning", "error")
+    ]
     judged = []
-    for finding in findings:
-        blocks = finding.severity != "note" and (
-            finding.check in states or finding.check in of_record
-        )
-        if blocks and finding.severity == "warning" and finding.check in accepted:
-            states[finding.check] = "accepted"
-            judged.append(replace(finding, severity="note"))
-            continue
-        if blocks and states.get(finding.check) != "wrong":
-            states[finding.check] = "wrong" if finding.tested else "untested"
+    for finding in [*findings, *warned]:
+        check = finding.check
+        if finding.severity == "warning" and (check in accept or check in before):
+            finding, states[check] = replace(finding, severity="note"), ACCEPTED  # noqa: PLW2901
+        elif (
+            finding.severity != "note"
+            and check in {*made, *entries}
+            and states.get(check) != "wrong"
+        ):
+            states[check] = "wrong" if finding.tested else "untested"
         judged.append(finding)
     return judged, states
 
@@ -205,31 +183,27 @@ def record_accepted(source: Source, findings: Iterable[Finding], accept: Collect
         ArgumentError: the source is not a folder.
     """
     for path, sequence in source.sequences().items():
-        own = [
-            f for f in findings if f.sequence == path and f.check in accept and f.severity == "note"
-        ]
-        if not own:
-            continue
-        if not isinstance(sequence, FolderSequence):
+        own = {f.check: f.found for f in findings if f.sequence == path and f.severity == "note"}
+        own = {check: own[check] for check in accept if check in own}
+        if own and not isinstance(sequence, FolderSequence):
             raise ArgumentError(
                 "accept", expected="a folder, whose carlasc.json says so", found=source.location
             )
-        kept = [one for one in _entries(sequence) if one.get("check") not in accept]
-        new = [
-            {"check": f.check, "verdict": ACCEPTED, "message": f.found.removeprefix("warning: ")}
-            for f in own
-        ]
-        metadata = sequence.metadata
-        extra = {**metadata.extra, "findings": [*kept, *new]}
-        FolderWriter(sequence.folder).write_document(
-            layout.METADATA, replace(metadata, extra=extra).to_json()
-        )
+        if own and isinstance(sequence, FolderSequence):
+            kept = _entries(sequence) | {check: (ACCEPTED, own[check]) for check in own}
+            entries = [
+                {"check": check, "verdict": verdict, "message": message}
+                for check, (verdict, message) in kept.items()
+            ]
+            metadata = sequence.metadata
+            changed = replace(metadata, extra={**metadata.extra, "findings": entries})
+            FolderWriter(sequence.folder).write_document(layout.METADATA, changed.to_json())
 
 
-def _entries(sequence: Sequence) -> list[dict[str, Any]]:
-    """Return the entries of `findings` in carlasc.json."""
+def _entries(sequence: Sequence) -> dict[str, tuple[str, str]]:
+    """Return verdict and message by check, of `findings` in carlasc.json."""
     try:
-        entries = sequence.metadata.extra.get("findings")
-    except CarlascError:  # which is reported elsewhere
-        return []
-    return [one for one in entries if isinstance(one, dict)] if isinstance(entries, list) else []
+        entries = sequence.metadata.extra.get("findings", [])
+        return {one["check"]: (one["verdict"], one["message"]) for one in entries}
+    except (CarlascError, TypeError, KeyError):  # of a broken file, which is reported elsewhere
+        return {}

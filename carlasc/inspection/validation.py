@@ -41,18 +41,13 @@ from carlasc.inspection.image_alignment import compare_images, judge_images
 from carlasc.inspection.pose_quality import check_poses, check_times, describe_mounting
 from carlasc.inspection.soundness import (
     CHECKS,
-    GROUND,
-    OCCUPIED,
     OVERLAP,
-    RANGE,
     ScanFacts,
-    check_occupied,
     judge,
     record_accepted,
-    recorded,
     untested,
 )
-from carlasc.inspection.staleness import check_inputs
+from carlasc.inspection.staleness import check_inputs, check_sample
 from carlasc.motion.ground import ground_of
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
@@ -148,6 +143,7 @@ def validate(
     *,
     every: int | None = None,
     accept: Collection[str] = (),
+    sample: int = 0,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> ValidationResult:
     """Check a data set: files against each other, values, poses, times, and scans against poses and
@@ -163,6 +159,8 @@ def validate(
             sequence.
         accept: checks whose warnings are true of the place, as in a tunnel: carlasc.json of the
             sequence then says so.
+        sample: number of frames of each grid that are made again from the scans beside it and
+            compared.
         run: how the work is spread over the sequences, with a callback for progress.
 
     Returns:
@@ -187,12 +185,15 @@ def validate(
         examined = run_all(_examine, plans, run, lost=_fail)
     for plan, (in_sequence, report) in zip(plans, examined, strict=True):
         named = [replace(finding, sequence=plan.sequence.path) for finding in in_sequence]
+        if sample > 0:
+            path, more = plan.sequence.path, check_sample(plan.sequence, sample, run)
+            named += [replace(finding, sequence=path) for finding in more]
         findings += sorted(named, key=lambda finding: SEVERITIES.index(finding.severity))
         reports.append(report)
         if not run.is_alone:
             step(plan.steps)
     if unknown := sorted({*accept} - {*CHECKS} - {finding.check for finding in findings}):
-        raise ArgumentError("accept", expected=f"checks, such as {GROUND}", found=unknown[0])
+        raise ArgumentError("accept", expected=f"checks, such as {OVERLAP}", found=unknown[0])
     record_accepted(opened, findings, accept)
     return ValidationResult(opened.location, tuple(findings), tuple(reports))
 
@@ -244,19 +245,15 @@ def _examine(plan: _CheckedFrames, step: Callable[[], None] = lambda: None) -> _
         findings.extend(check_shapes(sequence, frame, with_grids=described))
         step()
     facts, evidence, below = ScanFacts(), dict[str, GridEvidence](), dict[str, GroundBelow]()
-    occupied: dict[str, list[bool]] = {}
     for frame in plan.read:
         if described:
             findings.extend(check_values(sequence, frame))
-            _measure_grids(sequence, frame, facts, evidence, below, occupied)
+            _measure_grids(sequence, frame, facts, evidence, below)
         step()
-    made = [OCCUPIED] if occupied else []
+    made = facts.made(sequence) if described else []
     if described:
         findings.extend(check_reports(sequence, plan.read))
-        findings.extend(recorded(sequence))
-        if "points" in sequence.fields():
-            made += [RANGE, GROUND] if sequence.metadata.has_rays else [RANGE]
-            findings.extend(facts.findings(sequence))
+        findings.extend(facts.findings(sequence))
         findings.extend(check_inputs(sequence))
     shares = {}
     for name, grid in evidence.items():
@@ -265,8 +262,6 @@ def _examine(plan: _CheckedFrames, step: Callable[[], None] = lambda: None) -> _
             shares[name] = diagnosis.share
             findings.extend(_judge_grid(sequence, name, grid.spec, diagnosis))
         findings.extend(below[name].findings(sequence, name))
-    for name, own in occupied.items():
-        findings.extend(check_occupied(sequence, name, own))
     poses, overlap = _diagnose_poses(sequence)
     if poses is not None and overlap is not None:
         made.append(OVERLAP)
@@ -305,7 +300,6 @@ def _measure_grids(
     facts: ScanFacts,
     evidence: dict[str, GridEvidence],
     below: dict[str, GroundBelow],
-    occupied: dict[str, list[bool]],
 ) -> None:
     """Measure the points of a frame, and compare them with its grids.
 
@@ -325,7 +319,7 @@ def _measure_grids(
             grid = sequence.grid(name, frame)
         except CarlascError:
             continue
-        occupied.setdefault(name, []).append(bool(((grid.labels != 0) & grid.known).any()))
+        facts.occupied.setdefault(name, []).append(bool((grid.labels * grid.known).any()))
         if points is not None and ground is not None:
             evidence.setdefault(name, GridEvidence(grid.spec)).add(points, labels, grid)
             below.setdefault(name, GroundBelow(grid.spec)).add(ground)

@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from carlasc.core.arrays import (
+    AnyFloatArray,
     BoolArray,
     Float32Array,
     FloatArray,
@@ -33,7 +34,15 @@ from carlasc.core.arrays import (
     LabelArray,
     Uint32Array,
 )
-from carlasc.core.cells import Pose, as_pose, distinct, fast_azimuth, numbered, transform
+from carlasc.core.cells import (
+    Pose,
+    as_pose,
+    distinct,
+    fast_azimuth,
+    first_of_cells,
+    numbered,
+    transform,
+)
 from carlasc.core.compiling import cached, inlined
 from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
 from carlasc.core.scans import finite, runs_of_origins
@@ -54,6 +63,10 @@ _BAND_M = (
 )
 _FLAGGED_SHARE = 0.6  # a cluster with this share of moved points moved as a whole
 _PERIOD_S = 0.1  # period of scans whose times do not increase
+OWN_CELL_M, OWN_REACH_M = 0.2, 4.0
+"""Parts of the recording vehicle are found in cells of this size around the sensor, up to this
+distance.
+"""
 
 
 @dataclass(frozen=True)
@@ -108,6 +121,7 @@ class FreeSpaceEvidence:
         around: number of static points around each cluster, at its height. It is large for pieces
             of static objects.
         world_T_sensor: (4, 4) pose of the scan.
+        near: (K, 3) cells of the points around the sensor that are not ground: see `cells_around`.
     """
 
     frame: int
@@ -119,6 +133,7 @@ class FreeSpaceEvidence:
     freed: tuple[int, ...]
     around: tuple[int, ...]
     world_T_sensor: Transform
+    near: IntArray
 
     def thinned(self, most: int = 400) -> FreeSpaceEvidence:
         """Return the same with at most `most` of the `points` of each cluster; `clusters` stay
@@ -224,7 +239,17 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     ]
     around = _count_around(world, groups, static)
     parts = (tuple(clusters), tuple(points), tuple(classes), freed, around)
-    return FreeSpaceEvidence(scan.frame, own.seconds, len(scan.points), *parts, scan.world_T_sensor)
+    near = cells_around(scan.points[candidates])
+    return FreeSpaceEvidence(
+        scan.frame, own.seconds, len(scan.points), *parts, scan.world_T_sensor, near
+    )
+
+
+def cells_around(points: AnyFloatArray) -> IntArray:
+    """Return the (K, 3) cells of (N, 3) points near the sensor, metres, sensor frame, each once."""
+    near = points[(np.abs(points) < OWN_REACH_M).all(axis=1)]
+    cells = np.floor(near / OWN_CELL_M).astype(np.int64)
+    return cells[first_of_cells(cells)]
 
 
 def _sensors(origins: Float32Array) -> list[IntArray]:

@@ -5,14 +5,15 @@ They are followed from scan to scan.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from carlasc.core.arrays import FloatArray, IntArray
-from carlasc.core.geometry import Transform, invert, thin, transform_points
-from carlasc.motion.evidence import FreeSpaceEvidence
+from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
+from carlasc.motion.evidence import OWN_CELL_M, FreeSpaceEvidence, cells_around
 from carlasc.motion.paths import estimate_path, is_static, middles_of, misalignment
 from carlasc.motion.planes import nearest_points
 from carlasc.motion.segments import Segment
@@ -39,13 +40,16 @@ _WEIGHTS = (1.0, 1.5, -12.5, 5.0, 1.5, -4.5)  # of 1 and of the terms of `_confi
 _LEAST_CONFIDENCE = 0.5  # of an actor
 _STAYS_M, _SENSOR_PATH_M = 0.5, 1.0  # points that move with the sensor, while it drives so far
 _LINE_SLOPE = 0.004  # a quarter of a degree: the points of one scan line differ by less
-# half the width of the recording vehicle, and how far from the sensor it reaches
-_OWN_HALF_M, _OWN_REACH_M = (
-    1.3,
-    3.5,
-)
-_OWN_MARGIN_M = 0.2  # around most of its points
+# Parts of the recording vehicle: cells around the sensor in which nearly all scans have points,
+# often at places that were free at other times; and cells beside them with such points.
+_ALWAYS, _FREED, _OFTEN = 0.95, 0.3, 0.3
+_BESIDE_M = 1.8  # farther beside the way of the sensor, another vehicle may drive along
+_OWN_SHARE = 0.5  # an actor with so many points in these cells is none
 _SAMPLES = 300  # points of an observation that its path is estimated from
+
+
+_Cell = tuple[int, int, int]
+_ELSEWHERE: _Cell = (1 << 20, 0, 0)
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,8 @@ class ActorFollower:
     Attributes:
         moved: (M,) indices of the points that moved, tracked or not, by frame.
         own: (6,) lower and upper corners of the parts of the recording vehicle, metres, sensor
-            frame.
+            frame; known after `finish`.
+        riders: the numbers of the actors that are such parts; known after `finish`.
     """
 
     def __init__(
@@ -91,6 +96,10 @@ class ActorFollower:
         """
         self.moved: dict[int, IntArray] = {}
         self.own: list[FloatArray] = []
+        self.riders: set[int] = set()
+        self._near, self._freed = Counter[_Cell](), Counter[_Cell]()
+        self._cells: dict[int, Counter[_Cell]] = {}
+        self._poses: list[Transform] = []
         self._deformable, self._label, self._number = deformable, default_label, first_instance
         self._alive: list[_ActorChain] = []
 
@@ -99,6 +108,11 @@ class ActorFollower:
         before it.
         """
         self.moved[scan.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
+        self._poses.append(scan.world_T_sensor)
+        self._near.update(_cells(scan.near))
+        for points in scan.points:
+            local = transform_points(invert(scan.world_T_sensor), points)
+            self._freed.update(_cells(cells_around(local)))
         before, self._alive = self._alive, []
         ended = list[_ActorChain]()
         for one in before:
@@ -109,16 +123,50 @@ class ActorFollower:
         return actors
 
     def finish(self) -> list[FoundActor]:
-        """Return the actors that have not ended."""
-        return self._actors(self._alive)
+        """Return the actors that have not ended, and find the parts of the recording vehicle."""
+        actors = self._actors(self._alive)
+        own = self._own_cells()
+        for number, cells in self._cells.items():
+            inside = sum(count for cell, count in cells.items() if cell in own)
+            if inside > _OWN_SHARE * cells.total():
+                self.riders.add(number)
+        lower = np.array(sorted(own), np.float64).reshape(-1, 3) * OWN_CELL_M
+        self.own = list(np.hstack([lower - OWN_CELL_M / 2, lower + 1.5 * OWN_CELL_M]))
+        return [actor for actor in actors if actor.segments[0].instance not in self.riders]
+
+    def _own_cells(self) -> set[_Cell]:
+        """Return the cells of the recording vehicle: what stays at one place of the sensor frame
+        over the whole drive, and is not static.
+        """
+        poses, scans = np.array(self._poses).reshape(-1, 4, 4), len(self._poses)
+        steps = np.diff(poses[:, :3, 3], axis=0)
+        if np.abs(steps).sum(axis=0).max(initial=0.0) < _SENSOR_PATH_M:
+            return set()
+        x, y, _ = multiply(invert(poses[:-1])[:, :3, :3], steps[..., None]).sum(axis=0)[:, 0]
+        beside_m = _BESIDE_M / OWN_CELL_M * max(float(np.hypot(x, y)), 1e-6)
+        own = {
+            cell
+            for cell, count in self._near.items()
+            if count >= _ALWAYS * scans
+            and self._freed[cell] >= _FREED * scans
+            and abs(x * cell[1] - y * cell[0]) < beside_m
+        }
+        waiting = list(own)
+        while waiting:
+            i, j, k = waiting.pop()
+            for di, dj, dk in np.ndindex(3, 3, 3):
+                beside = (i + di - 1, j + dj - 1, k + dk - 1)
+                if beside not in own and self._freed[beside] >= _OFTEN * scans:
+                    own.add(beside)
+                    waiting.append(beside)
+        return own
 
     def _actors(self, chains: list[_ActorChain]) -> list[FoundActor]:
         actors = []
         for one in chains:
-            if (part := one.own_vehicle()) is not None:
-                self.own.append(part)
-            elif actor := one.actor(self._deformable, self._number, self._label):
+            if actor := one.actor(self._deformable, self._number, self._label):
                 actors.append(actor)
+                self._cells[self._number] = one.cells()
                 self._number += 1
         return actors
 
@@ -322,21 +370,15 @@ class _ActorChain:
             local if stays and driven > _SENSOR_PATH_M and len(local) >= _MIN_OBSERVATIONS else None
         )
 
-    def own_vehicle(self) -> FloatArray | None:
-        """Return the (6,) lower and upper corner, metres, sensor frame, of a part of the recording
-        vehicle; None if it is none.
+    def cells(self) -> Counter[_Cell]:
+        """Return how many observations have points in each cell around the sensor, and elsewhere
+        (one cell far away).
         """
-        local = self._in_sensor()
-        if local is None:
-            return None
-        steps = np.gradient(np.stack([link.world_T_sensor[:2, 3] for link in self.links]), axis=0)
-        for link, step in zip(self.links, steps, strict=True):
-            x, y, _ = (link.segment.points - link.world_T_sensor[:3, 3]).T
-            across = np.abs(x * step[1] - y * step[0]) / max(float(np.hypot(*step)), 1e-6)
-            if across.max() > _OWN_HALF_M or np.hypot(x, y).max() > _OWN_REACH_M:
-                return None
-        low, high = np.quantile(np.concatenate(local), (0.05, 0.95), axis=0)
-        return np.concatenate([low - _OWN_MARGIN_M, high + _OWN_MARGIN_M])
+        counts = Counter[_Cell]()
+        for link in self.links:
+            local = transform_points(invert(link.world_T_sensor), link.segment.points)
+            counts.update(_cells(cells_around(local)) or [_ELSEWHERE])
+        return counts
 
     def _is_scan_line(self) -> bool:
         """Return whether its points are of one scan line and move with the sensor, as where a scan
@@ -349,6 +391,10 @@ class _ActorChain:
         return bool(
             np.ptp(np.quantile(z / np.maximum(np.hypot(x, y), 1e-3), (0.05, 0.95))) < _LINE_SLOPE
         )
+
+
+def _cells(cells: IntArray) -> list[_Cell]:
+    return [(x, y, z) for x, y, z in cells.tolist()]
 
 
 def _is_small(size: FloatArray) -> bool:

@@ -30,12 +30,11 @@ _STEP = np.array([0.05, 0.05, 0.05, 2e-3, 2e-3, 2e-3, 0.01])  # steps of the num
 # greatest error of a known value
 _DETERMINED = np.array([0.2, 0.2, 0.2, *np.deg2rad([1.0, 1.0, 1.0]), 0.03])
 # smaller values need no correction
-# fact: relevant-mounting
 _RELEVANT = np.array([0.15, 0.15, 0.15, *np.deg2rad([0.5, 0.5, 0.5]), 0.02])
-_CERTAIN = 2.0  # values within so many times their error need none either
+_CERTAIN = 2.5  # values within so many times their error need none either
 # least half width of an interval: scans are not corrected for motion exactly, nor interpolated
-_SYSTEMATIC = np.array([0.02, 0.02, 0.02, *np.deg2rad([0.1, 0.1, 0.1]), 0.005])
-_GROUP = 15  # scans whose errors are similar
+_SYSTEMATIC = np.array([0.08, 0.08, 0.08, *np.deg2rad([0.1, 0.1, 0.1]), 0.01])
+_GROUP, _GROUPS = 30, 3  # most scans whose errors are related, and least groups of them
 _EXPLAINED = 3.0  # least variance that a value explains, in variances of what remains
 _LIMITS = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5, 2.0])  # greatest values
 _NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "late")
@@ -110,7 +109,8 @@ def find_mounting(
         runs: the aligned poses, in any frame: the row of the first scan, and the (K, 4, 4) poses of
             this scan and the following ones.
     """
-    parts = [_Motions.of(poses, seconds, first, aligned) for first, aligned in runs]
+    related = min(_GROUP, sum(len(aligned) for _, aligned in runs) // _GROUPS)
+    parts = [_Motions.of(poses, seconds, first, aligned, related) for first, aligned in runs]
     if sum(len(part.given) for part in parts) < 2 * len(_LEAST) * len(_LAGS):
         return None
     values = np.zeros(7)
@@ -176,8 +176,9 @@ class _Motions:
         seconds: FloatArray,
         first: int,
         aligned: FloatArray,
+        related: int,
     ) -> _Motions:
-        """Pair the scans of a run."""
+        """Pair the scans of a run; `related` scans are a group."""
         rows = np.concatenate(
             [
                 np.stack([np.arange(len(aligned) - lag), np.arange(lag, len(aligned))], axis=1)
@@ -188,7 +189,7 @@ class _Motions:
         )
         given, own = poses[first + rows], seconds[first : first + len(aligned)]
         motions = multiply(invert(given[:, 0]), given[:, 1])
-        return cls(motions, aligned, own, own[rows], rows.sum(axis=1) // (2 * _GROUP))
+        return cls(motions, aligned, own, own[rows], rows.sum(axis=1) // (2 * related))
 
 
 def _residuals(parts: Sequence[_Motions], values: FloatArray) -> FloatArray:

@@ -21,12 +21,13 @@ from typing import Any
 import numpy as np
 
 from carlasc.core.arrays import AnyArray, IntArray
-from carlasc.errors import ConflictError, MissingDataError
+from carlasc.errors import CompleteError, ConflictError, MissingDataError
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.copying import UnpackResult, refuse_overlap, unpack
 from carlasc.storage.files import (
     AnyPath,
+    has_content,
     make_folder,
     replaced,
     sync_all,
@@ -43,6 +44,7 @@ from carlasc.storage.transport.trees import is_url
 from carlasc.storage.views import ChosenSequences, SequenceView
 
 _MOST_UNREAD = 64  # frames
+_RECORD = layout.record_file("copy")  # of the input and options, in the finished copy
 
 
 @dataclass
@@ -193,15 +195,18 @@ class DerivedCopy:
         Raises:
             ConflictError: something at `out` may not be replaced, `out` lies inside `source`, or an
                 interrupted run had another input or other options.
+            CompleteError: `out` is the copy that this call would make.
         """
         run.part.refuse(overwrite)
         refuse_overlap(out, source)
         self.source, self.out, self.overwrite = source, out, overwrite
         self.mark: Path | None = None
         if not is_url(out) and run.part.count == 1:
-            _clear(Path(out), kind, is_kind, overwrite=overwrite)
             inputs = sequence_states(source)
             settings = {"source": source.location, "kind": kind, "inputs": inputs, **made_from}
+            if not overwrite and has_content(record := Path(out) / _RECORD):
+                check_complete(out, record.read_bytes() == to_json(settings))
+            _clear(Path(out), kind, is_kind, overwrite=overwrite)
             self.mark = _mark(unfinished(Path(out)), settings, overwrite=overwrite)
 
     def writer(self, path: str) -> SequenceWriter | None:
@@ -229,6 +234,7 @@ class DerivedCopy:
         if self.mark is not None:
             for path in sequences:
                 shutil.rmtree(Path(self.out) / path / layout.DERIVED, ignore_errors=True)
+            write_atomic(Path(self.out) / _RECORD, self.mark.read_bytes())
             self.mark.unlink(missing_ok=True)
             if self.overwrite:
                 remove(replaced(Path(self.out)))
@@ -238,6 +244,17 @@ class DerivedCopy:
             linked=linked,
             left_out=sorted({name for one in sequences.values() for name in one.left_out}),
         )
+
+
+def check_complete(out: AnyPath, is_complete: bool) -> None:
+    """Say that an output needs no work.
+
+    Raises:
+        CompleteError: it is complete.
+    """
+    if is_complete:
+        problem, advice = "it is complete, and nothing changed", "`overwrite=True` makes it again"
+        raise CompleteError(out, problem=problem, advice=advice)
 
 
 def _clear(out: Path, kind: str, is_kind: Callable[[Metadata], bool], *, overwrite: bool) -> None:

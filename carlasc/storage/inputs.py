@@ -32,6 +32,11 @@ from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 from carlasc.storage.transport.trees import Tree
 
+UNKNOWN = (
+    "there is no record of what existing frames were made from: they are kept; "
+    '`compare_inputs="content"` compares them'
+)
+"""The note on outputs of an older version, or whose record was deleted."""
 _FORMAT = 1
 _BYTES = 16  # of the digest of a file
 _SHORT = 8  # bytes of the digests in records
@@ -190,14 +195,19 @@ def _states(files: FrameFiles, frames: list[int]) -> dict[int, str]:
     }
 
 
-def sequence_states(source: Source) -> dict[str, str]:
-    """Return the state of the text files and the scans of each sequence of a source, by path."""
+def sequence_states(source: Source, *more: str) -> dict[str, str]:
+    """Return the state of the text files, the scans and the pictures of each sequence of a source,
+    by path, and of more fields.
+    """
     states = {}
     for path, sequence in source.sequences().items():
-        files = SequenceFiles(sequence, *(name for name in sequence.fields() if "/" not in name))
-        own = _states(files, sequence.scan_frames().tolist())
+        own = [name for name in sequence.fields() if "/" not in name]
+        files = SequenceFiles(sequence, *own, *more)
         texts = [(name, sequence.read_document(name)) for name in sequence.documents()]
-        states[path] = combined(own, [text for text in texts if "/" not in text[0]])
+        states[path] = combined(
+            _states(files, sequence.scan_frames().tolist()),
+            [text for text in texts if "/" not in text[0]],
+        )
     return states
 
 

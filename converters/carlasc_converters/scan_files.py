@@ -13,7 +13,7 @@ import numpy as np
 
 from carlasc.converting import Cloud, FrameHandle
 from carlasc.core.arrays import Uint32Array
-from carlasc.core.geometry import Transform, invert, transform_points
+from carlasc.core.geometry import Transform
 from carlasc.errors import FormatError
 from carlasc.relabelling.predictions import load
 from carlasc.storage.arrays import NUMBERS, ArrayFormat, read_npy
@@ -84,7 +84,7 @@ class ScanFile(FrameHandle):
 
     def _read(self, index: int, path: str) -> Cloud:
         columns = read_columns(Path(path), self.options.columns)
-        fields = named_fields(columns, path, self.clock)
+        fields = named_fields(columns, path, self.clock, self.world_T_scan)
         if set(fields) - _NOT_ALL != set(self.fields) - _NOT_ALL:
             raise FormatError(
                 path,
@@ -110,8 +110,6 @@ class ScanFile(FrameHandle):
             )
         points = points[finite]
         points[:, 3] = np.nan_to_num(points[:, 3])
-        if self.world_T_scan is not None:
-            points[:, :3] = transform_points(invert(self.world_T_scan), points[:, :3])
         if not np.array_equal(self.options.axes, np.eye(4)):
             points = points.copy()
             points[:, :3] = points[:, :3] @ self.options.axes[:3, :3].T.astype(np.float32)

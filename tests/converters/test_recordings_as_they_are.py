@@ -493,3 +493,55 @@ def test_a_lidar_that_moves_on_the_vehicle_is_placed_by_the_transforms(tmp_path,
     said = " ".join(recording.notes())
     assert f"{name} moves on {bags.BASE}" in said
     assert f"transforms that were not used: {bags.BASE} > imu" in said
+
+
+@pytest.mark.parametrize("degrees", [90, 135, 180])
+def test_the_order_of_quaternions_is_found_for_any_heading(tmp_path, degrees):
+    for frame in range(3):
+        write_pcd(tmp_path / "s" / f"{frame}.pcd", points_of(frame))
+    turn = rotation_z(np.deg2rad(degrees))
+    poses = np.stack([turn @ pose_of(frame) for frame in range(3)])
+    turns = quaternions_of(poses[:, :3, :3])  # w first
+    np.savetxt(tmp_path / "poses.txt", np.column_stack([np.arange(3) / 10, poses[:, :3, 3], turns]))
+    (recording,) = Scans(tmp_path / "s", pose_file=str(tmp_path / "poses.txt")).sequences()
+    found = recording.poses()
+    certain = degrees != 180  # else the ground is below in both, and the overlap of scans decides
+    assert (found.other is None) == certain
+    np.testing.assert_allclose(found.world_T_vehicle if certain else found.other, poses, atol=1e-9)
+
+
+def test_points_in_the_frame_of_a_map_projection_keep_their_millimetres(tmp_path):
+    offset = translation((500123.456, 5400321.789, 250.0))
+    for frame in range(3):
+        pose = offset @ pose_of(frame)
+        points = transform_points(pose, DRIVE.scan(frame).points[:, :3].astype(np.float64))
+        numbers = (*pose[:3, 3], *quaternions_of(pose[None, :3, :3])[0])
+        columns = dict(zip("xyz", points.T, strict=True))
+        write_pcd(tmp_path / "s" / f"{frame}.pcd", columns, numbers)
+    (recording,) = Scans(tmp_path / "s").sequences()
+    for frame, handle in enumerate(recording.frames):
+        (cloud,) = handle.read()
+        np.testing.assert_allclose(cloud.points[:, :3], DRIVE.scan(frame).points[:, :3], atol=1e-3)
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_scans_without_labels_among_others_are_unlabelled(tmp_path, beside):
+    (tmp_path / "labels").mkdir()
+    for frame in range(3):
+        columns, labels = points_of(frame), np.full(len(DRIVE.scan(frame).points), 40, np.uint32)
+        if frame != 1 and beside:
+            labels.tofile(tmp_path / "labels" / f"{frame}.label")
+        elif frame != 1:
+            columns["label"] = labels
+        write_pcd(tmp_path / "s" / f"{frame}.pcd", columns)
+    options = {"label_dir": str(tmp_path / "labels")} if beside else {}
+    (recording,) = Scans(tmp_path / "s", source_classes="semantickitti", **options).sequences()
+    clouds = [handle.read()[0] for handle in recording.frames]
+    assert [set(cloud.labels.tolist()) for cloud in clouds] == [{40}, {0}, {40}]
+    if beside:
+        assert any("1 of 3 scans have no file of labels" in note for note in recording.notes())
+        for file in (tmp_path / "labels").iterdir():
+            file.unlink()
+        (recording,) = Scans(tmp_path / "s", source_classes="semantickitti", **options).sequences()
+        with raises(MissingDataError, where="labels", found="none for any scan"):
+            recording.frames  # noqa: B018

@@ -15,7 +15,7 @@ def files(out: Path) -> dict[str, bytes]:
     return {
         path.relative_to(out).as_posix(): path.read_bytes()
         for path in sorted(out.rglob("*"))
-        if path.is_file() and ".carlasc" not in path.parts
+        if path.is_file() and not path.match("carlasc-*-of-*.json")
     }
 
 

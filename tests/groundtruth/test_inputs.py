@@ -304,3 +304,15 @@ def test_scans_in_an_object_store(drive, tmp_path, monkeypatch):
         regrid(source, SPEC, tmp_path / "fresh", observe=STILL, run=ALONE)
         carlasc.unpack(f"s3://{BUCKET}/out", tmp_path / "unpacked", run=ALONE)
         assert outputs(out) == outputs(tmp_path / "fresh") == outputs(tmp_path / "unpacked")
+
+
+def test_validate_makes_a_sample_of_frames_again(made):
+    def found() -> str:
+        result = carlasc.validate(made, sample=2)
+        (finding,) = [one for one in result.findings if "seed" in one.found]
+        return f"{finding.severity}: {finding.found}"
+
+    assert found() == "note: 0 of 2 frames that differ (seed 0)"
+    for path in (scans(made) / "evaluation_32x32x8").glob("*.label"):
+        path.write_bytes(bytes(path.stat().st_size))
+    assert found().startswith("warning: 2 of 2 frames")

@@ -179,7 +179,9 @@ class ScanSequence(StoredSequence):
             MissingDataError: there are no poses.
             FormatError: poses or times are not valid.
         """
-        sequence = with_estimated_poses(self.sequence) if self.estimates_poses else self.sequence
+        sequence = self.sequence
+        if self.estimates_poses:
+            sequence = with_estimated_poses(sequence, self.options.poses.odometry_voxel_m)
         check_trajectory(sequence, self.options)
         return sequence
 
@@ -426,8 +428,8 @@ def must_estimate(sequence: Sequence, options: FromScans) -> bool:
     return source == "kiss-icp" or (source == "auto" and layout.POSES not in sequence.documents())
 
 
-def with_estimated_poses(sequence: Sequence) -> Sequence:
-    """Return a sequence with poses estimated by KISS-ICP.
+def with_estimated_poses(sequence: Sequence, voxel_m: float | None) -> Sequence:
+    """Return a sequence with poses estimated by odometry, in voxels of some size.
 
     Lines of frames without a scan repeat the pose of the last scan.
 
@@ -440,7 +442,10 @@ def with_estimated_poses(sequence: Sequence) -> Sequence:
     times = sequence.times_of(frames)
     try:
         poses = estimate_poses(
-            scans, times=times, max_range_m=sequence.metadata.max_range_m or _RANGE_M
+            scans,
+            times=times,
+            max_range_m=sequence.metadata.max_range_m or _RANGE_M,
+            voxel_m=voxel_m,
         )
     except ArgumentError as error:  # an argument there, data here
         raise FormatError(

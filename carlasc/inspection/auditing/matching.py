@@ -31,6 +31,8 @@ from carlasc.core.tables import (
     remaps_between,
 )
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, count, first_names, reading
+from carlasc.groundtruth.from_scans.motion_pass import refine_sequence
+from carlasc.inspection.reports import inputs_of
 from carlasc.metrics.grids import SequenceGrid
 from carlasc.metrics.pairs import Place, open_grids
 from carlasc.storage import as_source, layout
@@ -56,6 +58,7 @@ class MatchedGrids:
         absent: frames without a grid, within the span of the grids and at their usual interval.
         notes: what was assumed.
         height_m: height of the sensor above the origin of the grids.
+        of_these_poses: whether the grids were made with the poses of the recording.
     """
 
     grids: GridFrames
@@ -64,6 +67,7 @@ class MatchedGrids:
     absent: tuple[int, ...]
     notes: tuple[str, ...]
     height_m: float
+    of_these_poses: bool = False
 
     @property
     def path(self) -> str:
@@ -302,9 +306,30 @@ def _match_frames(grids: GridFrames, scans: Sequence, chosen: FrameRange) -> Mat
     made = [scan for _, scan in pairs]
     step = max(int(np.bincount(np.diff(made)).argmax()), 1) if len(made) > 1 else 1
     usual = [f for f in own if made[0] <= f <= made[-1] and (f - made[0]) % step == 0]
+    posed = _posed(grids, scans)
     return MatchedGrids(
-        grids, scans, tuple(pairs), tuple(sorted(set(usual) - set(made))), tuple(notes), height
+        grids,
+        posed or scans,
+        tuple(pairs),
+        tuple(sorted(set(usual) - set(made))),
+        tuple(notes),
+        height,
+        posed is not None,
     )
+
+
+def _posed(grids: GridFrames, scans: Sequence) -> Sequence | None:
+    """Return a recording under the poses with which the grids were made, by their record: given or
+    refined; None if they were not made from these scans.
+    """
+    if not isinstance(grids, SequenceGrid) or grids.sequence.location != scans.location:
+        return None
+    inputs = inputs_of(scans, grids.grid)
+    if inputs is None or layout.POSES not in scans.documents():
+        return None
+    if inputs.refines:
+        inputs.use_refined(refine_sequence(inputs.feed))
+    return inputs.feed.sequence
 
 
 def _token_times(grids: VoxelFrames) -> dict[str, float] | None:

@@ -82,7 +82,7 @@ def files_and_bytes(root: Path) -> dict[str, bytes]:
     return {
         path.relative_to(root).as_posix(): path.read_bytes()
         for path in sorted(root.rglob("*"))
-        if path.is_file() and ".carlasc" not in path.parts
+        if path.is_file() and not path.match("carlasc-*-of-*.json")
     }
 
 
