@@ -160,6 +160,11 @@ class Scorer:
                     f"{sum(ids.values())} voxels of the {side} have ids that are no class and "
                     f"{become}: {times(dict(sorted(ids.items())))}"
                 )
+        if self.rays is not None and np.isnan(self.rays.compute().rayiou):
+            yield (
+                "no ray was cast (RayIoU): no known position of the sensor is at least 1 m inside "
+                "of a grid; poses.txt gives those of other frames"
+            )
         guessed = [use.table for use in sorted(self.uses[0]) if use.found in ("assumed", "ids")]
         predicted, true = (np.flatnonzero(summed.counts.sum(axis=axis)) for axis in (0, 1))
         if guessed and len(predicted) and len(true) and predicted[-1] < true[-1]:
