@@ -384,6 +384,7 @@ class Grid:
     counts: AnyArray | None = None
 
     def __post_init__(self) -> None:
+        check_types(Grid, vars(self))
         for name, array in (("labels", self.labels), ("counts", self.counts)):
             if array is not None and array.shape != self.spec.size:
                 raise FormatError(
