@@ -115,13 +115,11 @@ class Dataset(_MapStyle):
     `occupied`, `flags` and `views` need grids made with `carlasc.Voting(keep_evidence=True)`;
     `instances` and `voxel_flow` need grids made with `keep_actors=True`. Points outside the range
     `min_range_m` to `max_range_m` of carlasc.json are left out. Arrays have the axes of the
-    sequences. Right-handed and left-handed data are mixed only if `axes` is given.
+    sequences, unless `axes` is set.
 
     Attributes:
         sequences: the sequences in use, in order. `sequence` of a sample is the name of one of
             them.
-        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the
-            left).
         classes: table of the class ids in samples, after the remap.
         transform: called with each sample; returns the sample to use. It can be set later (see
             `carlasc.Flip`).
@@ -138,7 +136,6 @@ class Dataset(_MapStyle):
         grids_source: AnyPath | Source | Iterable[AnyPath | Source] | None = None,
         fields: str | Iterable[str] = ("occupancy", "labels", "known"),
         remap: RemapLike = "auto",
-        axes: Axes | None = None,
         align: bool = True,
         inferred: bool = True,
         min_confidence: float = 0.0,
@@ -165,8 +162,6 @@ class Dataset(_MapStyle):
                 (carlasc11 or semantickitti19; other tables keep their ids), a name in
                 `carlasc.core.REMAPS`, a Remap, a mapping of ids, or a table of new ids by old id;
                 None keeps the ids of the data.
-            axes: "left" or "right": mirrors y of sequences with the other axes, which needs a grid
-                that is symmetric in y. None keeps the axes of the data.
             align: move past scans to the sensor frame of the frame by their poses; False stacks
                 them unmoved.
             inferred: False excludes completed voxels, which no scan saw, from `known` and
@@ -216,10 +211,11 @@ class Dataset(_MapStyle):
             )
 
         self.sequences = tuple(part.scans for part in self._parts)
-        handedness = {scans.location: scans.metadata.axes for scans in self.sequences}
-        if axes is not None:
-            check_choice("axes", axes, Axes)
-        self.axes: Axes = common_value(handedness, "axes", "give `axes`") if axes is None else axes
+        self._axes: Axes = common_value(
+            {scans.location: scans.metadata.axes for scans in self.sequences},
+            "axes",
+            "set `axes` of two data sets, and add them",
+        )
         specs = {
             part.grids.location: part.grids.grids[part.grid]
             for part in self._parts
@@ -228,10 +224,25 @@ class Dataset(_MapStyle):
         self._spec = grid if isinstance(grid, GridSpec) else None
         if specs and self._spec is None:
             self._spec = common_value(specs, "grid geometry")
-        if self._spec is not None and set(handedness.values()) != {self.axes}:
-            check_symmetric(self._spec, "y")
         self._label_map = self._make_label_map(remap)
         self.classes: ClassTable = self._label_map.target
+
+    @property
+    def axes(self) -> Axes:
+        """Handedness of the samples: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the
+        left). It is that of the data until another one is set, which mirrors samples in y.
+
+        Raises:
+            ArgumentError: the value is neither, or the grid is not symmetric in y.
+        """
+        return self._axes
+
+    @axes.setter
+    def axes(self, axes: Axes) -> None:
+        check_choice("axes", axes, Axes)
+        if self._spec is not None:
+            check_symmetric(self._spec, "y")
+        self._axes = axes
 
     @property
     def spec(self) -> GridSpec:

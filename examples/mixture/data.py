@@ -16,6 +16,7 @@ def mixture(augment: Augment, grid: GridSpec = GRID) -> ConcatDataset:
         table = Dataset(folder, remap=None).classes
         actors = table.moving | table.movable
         remap = {i: 0 if i == 0 else 1 + (i in actors) for i in table.names}
-        options = {"grid": grid, "remap": remap, "axes": "left", "transform": augment}
+        options = {"grid": grid, "remap": remap, "transform": augment}
         parts.append(Dataset(folder, "train", history=2, **options))
+        parts[-1].axes = "left"  # those of SemanticKITTI are right-handed
     return ConcatDataset(parts)
