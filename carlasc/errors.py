@@ -246,18 +246,18 @@ def check_types(function: Callable[..., object], arguments: Mapping[str, object]
     """
     for name, kinds in _kinds_of(function).items():
         value = arguments[name]
-        if not any(_is_a(value, kind) for kind in kinds):
+        if not _is_one_of(value, kinds):
             shown = [kind for kind in kinds if kind is not str or os.PathLike not in kinds]
             names = (_KIND_NAMES.get(kind, f"a {kind.__name__}") for kind in shown)
             raise ArgumentError(name, expected=" or ".join(dict.fromkeys(names)), found=repr(value))
 
 
-def _is_a(value: object, kind: type) -> bool:
-    if isinstance(value, str) and kind is not str:
-        return False  # a text is not meant as a sequence of its letters
-    if isinstance(value, bool) and kind in (Integral, Real):
-        return False
-    return isinstance(value, kind)
+def _is_one_of(value: object, kinds: list[type]) -> bool:
+    if isinstance(value, str):
+        return str in kinds  # a text is not meant as a sequence of its letters
+    if isinstance(value, bool):
+        kinds = [kind for kind in kinds if kind not in (Integral, Real)]
+    return isinstance(value, tuple(kinds))
 
 
 @cache
