@@ -22,7 +22,7 @@ import numpy as np
 from carlasc.converting.protocol import Sensor
 from carlasc.core.arrays import FloatArray
 from carlasc.core.geometry import poses_from, quaternions_of, relative_to
-from carlasc.testing.drives import SimulatedDrive, Thing, world_T_sensor
+from carlasc.testing.drives import SimulatedDrive, read_things, world_T_sensor
 
 _START_S = 1_700_000_000.0  # time of the first scan, since 1970
 
@@ -52,10 +52,6 @@ def _along(way: Mapping[str, Sequence[float]], at: FloatArray) -> FloatArray:
     return _poses(line + amplitude * np.sin(rate * at[..., None] + phase))
 
 
-def _things(rows: Sequence[Sequence[Any]]) -> tuple[Thing, ...]:
-    return tuple(Thing(kind, tuple(row[:3]), tuple(row[3:6]), *row[6:]) for kind, *row in rows)
-
-
 def _scene(told: Mapping[str, Any]) -> SimulatedDrive:
     """Return a drive with one LiDAR; without things, along the street."""
     height_m, roll, pitch = told["mount"]
@@ -65,20 +61,22 @@ def _scene(told: Mapping[str, Any]) -> SimulatedDrive:
         sensors=(Sensor("lidar", mount),),
         rolling=True,
         clockwise=True,
-        things=_things(told["things"]) if "things" in told else SimulatedDrive().things,
+        things=read_things(told["things"]) if "things" in told else SimulatedDrive().things,
         channels=32,
         columns=360,
         elevation_deg=tuple(told.get("elevation_deg", (-22.5, 22.5))),
         range_m=told.get("range_m", 60.0),
         noise_m=0.01,
-        body=_things(told.get("body", ())),
+        body=read_things(told.get("body", ())),
         way=partial(_along, told["way"]) if "way" in told else None,
     )
 
 
 SCENES: Final = {
     name: _scene(told)
-    for name, told in json.loads(files(__package__).joinpath("scenes.json").read_text()).items()
+    for name, told in json.loads(
+        files(__package__).joinpath("scenes.json").read_text("utf-8")
+    ).items()
 }
 """Recordings of 4 s with one LiDAR, by name.
 
