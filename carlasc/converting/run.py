@@ -137,25 +137,14 @@ def convert(
 
     check_choice("compare_inputs", compare_inputs, CompareInputs)
     found = find_recordings(converter)
-    recordings = choose_recordings(found, root, sequences, split)
-    recordings = _deal(recordings, run.part)
+    recordings = _deal(choose_recordings(found, root, sequences, split), run.part)
     if isinstance(grids, GridOptions):
         _check_rays(recordings)
-    has_flow, has_voxels = layout.flow == "auto", isinstance(grids, str)
-    plans = []
-    for one in recordings:
-        planned = plan_recording(
-            one,
-            converter,
-            sink,
-            target,
-            poses,
-            frames=FrameRange.of(frames),
-            level=layout.level,
-            flow=has_flow,
-            voxels=has_voxels,
-        )
-        plans.append(planned)
+    has_voxels, chosen = isinstance(grids, str), FrameRange.of(frames)
+    plans = [
+        plan_recording(one, converter, sink, layout, poses, frames=chosen, voxels=has_voxels)
+        for one in recordings
+    ]
     sources = SourceFiles.of(root, found, options, compare_inputs)
     records = [sources.begin(plan) for plan in plans]
     origin = f"{name if isinstance(name, str) else name.__name__} {root.name}"
