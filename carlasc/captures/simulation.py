@@ -116,8 +116,6 @@ class Simulator(Capture, ABC):
             DependencyError: a package is missing.
         """
 
-    is_simulated = True
-
     @cached_property
     def sensors(self) -> tuple[int, ...]:
         """The numbers of the sensors."""

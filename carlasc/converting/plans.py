@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from carlasc.converting.assembling import AxesAndClasses, Rig, VehicleMotion, read_scan
+from carlasc.converting.assembling import (
+    AxesAndClasses,
+    LayoutOptions,
+    Rig,
+    VehicleMotion,
+    read_scan,
+)
 from carlasc.converting.chosen import ChosenFrames
 from carlasc.converting.plausibility import (
     POSE_S,
@@ -100,7 +106,7 @@ class RecordingPlan(Examined):
             the frame of the scan; None if the data set has no boxes.
         flow: whether flow is written.
         voxels: geometry of the recording's own voxel grids, right-handed, if they are written.
-        force: whether estimated poses are not checked.
+        force: whether estimated poses are accepted without a check.
         voxel_m: size of the voxels of the odometry; None: by the distances of points.
         missing: numbers of the frames whose scan is not written yet.
         unfinished: numbers of the frames without a scan, or without the fields from the motion of
@@ -131,11 +137,6 @@ class RecordingPlan(Examined):
         self.trajectory = at_frames(
             first_T_scan @ invert(self.recording.vehicle_T_scan), self.times
         )
-
-    @property
-    def checked(self) -> str | None:
-        """The recording, for errors of its estimated poses; None if these are not checked."""
-        return None if self.force else self.recording.location
 
     @property
     def rig(self) -> Rig:
@@ -407,12 +408,10 @@ def plan_recording(
     recording: Recording,
     converter: Converter,
     sink: Sink,
-    target: AxesAndClasses,
+    output: LayoutOptions,
     options: PoseOptions,
     *,
     frames: FrameRange = FrameRange(),  # noqa: B008 (frozen)
-    level: bool = False,
-    flow: bool,
     voxels: bool,
 ) -> RecordingPlan:
     """Read and check the poses, times and boxes of a recording, and find missing frames in the
@@ -422,11 +421,9 @@ def plan_recording(
         recording: the recording.
         converter: the converter.
         sink: the output.
-        target: the axes and classes of the output.
+        output: axes and classes, flow if it is available, and whether scans are turned upright.
         options: where poses come from.
         frames: the frames to convert.
-        level: whether scans are turned upright.
-        flow: whether flow is written, if it is available.
         voxels: whether the recording's own voxel grids are written.
 
     Raises:
@@ -437,7 +434,7 @@ def plan_recording(
     """
     writer = sink.sequence(sequence_path(recording))
     known = options.force or writer.read_document(layout.POSES) is not None
-    seen = examine(recording, converter, options, frames=frames, level=level, known=known)
+    seen = examine(recording, converter, options, frames=frames, level=output.level, known=known)
     if problem := next((one for one in seen.findings if one.severity == "error"), None):
         raise FormatError(
             problem.location,
@@ -452,16 +449,16 @@ def plan_recording(
         writer=writer,
         pose_source=KISS_ICP if seen.trajectory is None else FILE,
         boxes=boxes,
-        flow=flow and (boxes is not None or (recording.has_labels and recording.has_instances)),
-        voxels=_check_voxels(recording, writer, target) if voxels else None,
+        flow=output.flow == "auto"
+        and (boxes is not None or (recording.has_labels and recording.has_instances)),
+        voxels=_check_voxels(recording, writer, output.of(converter)) if voxels else None,
         force=options.force,
         voxel_m=options.odometry_voxel_m,
     )
-    for handle in recording.frames:
-        if not writer.has("points", handle.number):
-            plan.missing.add(handle.number)
-        if not writer.has("points", handle.number) or not _finished(plan, handle.number):
-            plan.unfinished.add(handle.number)
+    numbers = {handle.number for handle in recording.frames}
+    plan.missing = {number for number in numbers if not writer.has("points", number)}
+    there = numbers - plan.missing
+    plan.unfinished = plan.missing | {n for n in there if not _finished(plan, n)}
     return plan
 
 
@@ -627,10 +624,10 @@ def write_found(plan: RecordingPlan, height_m: float | None) -> None:
         return
     metadata = Metadata.from_json(data, f"{plan.writer.location}/{layout.METADATA}")
     extra = dict(metadata.extra)
-    sensors = [dict(sensor) for sensor in extra.get("sensors", [])]
-    if height_m is not None and sensors and "height_m" not in sensors[0]:
-        sensors[0] |= {"height_m": round(height_m, 2), "height_from": "ground"}
-        extra["sensors"] = sensors
+    if height_m is not None and extra.get("sensors") and metadata.height_m is None:
+        first, *others = extra["sensors"]
+        found = {"height_m": round(height_m, 2), "height_from": "ground"}
+        extra["sensors"] = [{**first, **found}, *others]
     if plan.findings and "findings" not in extra:
         extra["findings"] = _recorded(plan.findings)
     if extra != metadata.extra:
@@ -887,8 +884,8 @@ def follow(
     ):
         poses.append(pose)
         yield numbers[index], pose
-    if poses and plan.checked is not None:
-        centres.check(np.stack(poses), plan.checked)
+    if poses and not plan.force:
+        centres.check(np.stack(poses), plan.recording.location)
 
 
 def fill_gaps(poses: Mapping[int, FloatArray], recording: Recording) -> FloatArray:

@@ -151,25 +151,14 @@ def convert(
     _check(root, sink, split, grids, run.part)
     compare = layout.compare_inputs
     found = find_recordings(converter)
-    recordings = choose_recordings(found, root, sequences, split)
-    recordings = _deal(recordings, run.part)
+    recordings = _deal(choose_recordings(found, root, sequences, split), run.part)
     if isinstance(grids, GridOptions):
         _check_rays(recordings)
-    has_flow, has_voxels = layout.flow == "auto", isinstance(grids, str)
-    plans = []
-    for one in recordings:
-        planned = plan_recording(
-            one,
-            converter,
-            sink,
-            target,
-            poses,
-            frames=FrameRange.of(frames),
-            level=layout.level,
-            flow=has_flow,
-            voxels=has_voxels,
-        )
-        plans.append(planned)
+    has_voxels, chosen = isinstance(grids, str), FrameRange.of(frames)
+    plans = [
+        plan_recording(one, converter, sink, layout, poses, frames=chosen, voxels=has_voxels)
+        for one in recordings
+    ]
     states = None if compare == "never" else _source_states(root, found, options)
     records = []
     for plan in plans:

@@ -73,7 +73,13 @@ def test_axes_are_proposed(axes):
     np.testing.assert_allclose(mount.level_T_scan, axes_named(axes), atol=0.02)
 
 
-@pytest.mark.parametrize("name", sorted(SCENES))
+QUICK = ("room", "upside-down")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in SCENES if name not in QUICK)],
+)
 def test_only_lidars_that_are_not_upright_are_called_so(name):
     drive = SCENES[name]
     mount = find_mount([drive.scan(frame).points for frame in (0, 10, 20, 29, 39)])
@@ -107,7 +113,7 @@ def test_scans_far_from_poses_and_in_their_gaps_have_none():
     ("world", "speed", "moves"), [(True, 6.0, True), (False, 6.0, False), (False, 0.0, False)]
 )
 def test_a_sensor_that_stands_although_its_scans_move_is_refused(world, speed, moves):
-    drive, centres = replace(DRIVE, speed=speed, frames=20), ScanCentres()
+    drive, centres = replace(DRIVE, speed=speed, frames=20, channels=8, columns=90), ScanCentres()
     for frame, seconds in enumerate(drive.times):
         points = drive.scan(frame).points[:, :3]
         centres.add(transform_points(drive.world_T_vehicle(seconds), points) if world else points)
@@ -160,7 +166,8 @@ def converted(kind, tmp_path, **options):
     return convert(kind, tmp_path / "in", tmp_path / "out", **options)
 
 
-@pytest.mark.parametrize("kind", [Mounted, pytest.param(OnVehicle, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [Mounted, OnVehicle])
 def test_scans_are_turned_upright_where_asked(kind, tmp_path):
     with raises(FormatError, expected="upright", found="up is -z", advice="level=True"):
         converted(kind, tmp_path)

@@ -264,7 +264,7 @@ def _recording_of(
 def _match_frames(grids: GridFrames, scans: Sequence, chosen: FrameRange) -> MatchedGrids:
     numbers, own, notes = grids.frames().tolist(), scans.frames("points").tolist(), list[str]()
     on_ground = grids.classes == OCC3D
-    height = _height_of(scans) if on_ground else 0.0
+    height = scans.metadata.height_m if on_ground else 0.0
     if height is None:
         height = _HEIGHT_M
         notes.append(f"the height of the sensor is not known: {height:g} m is assumed")
@@ -348,14 +348,6 @@ def _token_times(grids: VoxelFrames) -> dict[str, float] | None:
                 scene = scenes.get(folder.name, {})
                 return {token: float(entry["timestamp"]) / 1e6 for token, entry in scene.items()}
     return None
-
-
-def _height_of(scans: Sequence) -> float | None:
-    sensors = scans.metadata.extra.get("sensors")
-    first = sensors[0] if isinstance(sensors, list) and sensors else None
-    height: Any = first.get("height_m") if isinstance(first, dict) else None
-    is_number = isinstance(height, int | float) and not isinstance(height, bool)
-    return float(height) if is_number else None
 
 
 def _mapping(
