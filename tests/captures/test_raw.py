@@ -193,7 +193,7 @@ INVALID = {  # folder -> (array that is written over it, what is expected and fo
     "beyond the table": (
         "labels0",
         np.full(300, 25, np.uint32),
-        "class ids 0..24 .*",
+        "class ids of carla",
         "25 in 300 of 300",
     ),
     "short labels": (
