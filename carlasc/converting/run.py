@@ -55,8 +55,7 @@ from carlasc.storage.transport.trees import LocalTarget
 
 Grids = GridOptions | Literal["voxels"] | None
 _RECORD = "conversion"
-# the states of frames in the record; others were finished without a frame that is a gap
-_DONE, _FAILED, _GAP = "done", "failed", "gap"
+_GAP = "gap"  # in the record: a frame that failed, and others were finished without it
 _LOOKED_AT = (
     3  # number of sequences, and of scans of each, in which points outside of the grid are counted
 )
@@ -260,7 +259,7 @@ class _ConvertedFrom:
             self.states = None
             self.notes.append(f"{plan.writer.location}: {UNKNOWN}")
         else:
-            self._write({})
+            self._write(())
 
     def finish(self, conversion: Conversion) -> None:
         """Write the record, after the frames were written."""
@@ -271,14 +270,14 @@ class _ConvertedFrom:
                 where = self.plan.writer.location
                 self.notes.append(f"{where}: {made_again(conversion.changed, why)}")
         has_gaps = conversion.allow_gaps or self.plan.pose_source == KISS_ICP
-        self._write(dict.fromkeys(conversion.failed, _GAP if has_gaps else _FAILED))
+        self._write(conversion.failed if has_gaps else ())
 
-    def _write(self, failed: Mapping[int, str]) -> None:
+    def _write(self, gaps: Collection[int]) -> None:
         """Write the record of the states of now, unless they are not recorded."""
         if self.states is not None:
             own = dict(self.states)
             numbers = [handle.number for handle in self.plan.recording.frames]
-            frames = {str(number): failed.get(number, _DONE) for number in numbers}
+            frames = {str(number): _GAP if number in gaps else "done" for number in numbers}
             MadeFrom(combined(sorted(own.items())), own, frames).write(self.plan.writer, _RECORD)
 
 

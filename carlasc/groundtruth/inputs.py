@@ -315,14 +315,6 @@ class SequenceInput(ABC):
         """
         return whole
 
-    def written(self, writer: SequenceWriter, grid: str) -> list[str]:
-        """Return the fields that a run wrote for each frame: those of the grid, and those of scans
-        unless they are the source.
-        """
-        fields = [f"{grid}/{part}" for part in layout.GRID_FIELDS]
-        is_copy = os.path.realpath(writer.location) != os.path.realpath(self.location)
-        return [*(layout.SCAN_FIELDS if is_copy else ()), *fields]
-
     def summaries(self) -> Series[Mapping[str, Any]] | None:
         """Return the facts of each actor, by number; None if actors are not tracked."""
         return None
@@ -472,9 +464,11 @@ class InputCheck:
         """
         if not self._whole:
             return
-        record = self._record
+        record, writer = self._record, self.writer
         if self.gone:
-            self.writer.remove_frames(self.inputs.written(self.writer, self.grid), self.gone)
+            is_copy = os.path.realpath(writer.location) != os.path.realpath(self.inputs.location)
+            written = [f"{self.grid}/{part}" for part in layout.GRID_FIELDS]
+            writer.remove_frames([*(layout.SCAN_FIELDS if is_copy else ()), *written], self.gone)
         for frame in self.gone:
             del record.frames[str(frame)]
         record.frames |= {

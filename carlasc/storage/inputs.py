@@ -24,7 +24,7 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray
 from carlasc.core.choices import CompareInputs
-from carlasc.errors import CarlascError, count, first_names
+from carlasc.errors import CarlascError, count, first_names, first_runs
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
@@ -308,22 +308,10 @@ def describe_changes(old: Mapping[str, str], new: Mapping[str, str]) -> str:
         "added": list(map(int, new.keys() - old.keys())),
         "removed": list(map(int, old.keys() - new.keys())),
     }
-    parts = [f"{_named(frames)} {kind}" for kind, frames in kinds.items() if frames]
-    return ", ".join(parts)
-
-
-def _named(frames: Collection[int]) -> str:
-    """Return "scan 12", or "scans 3, 7 to 9 and 20 more"."""
-    spans = list[list[int]]()
-    for frame in sorted(frames):
-        if spans and frame == spans[-1][1] + 1:
-            spans[-1][1] = frame
-        else:
-            spans.append([frame, frame])
-    texts = [str(a) if a == b else f"{a} to {b}" for a, b in spans[:_NAMED]]
-    left = len(frames) - sum(b - a + 1 for a, b in spans[:_NAMED])
-    return f"scan{'s' * (len(frames) > 1)} {', '.join(texts)}" + (
-        f" and {left} more" if left else ""
+    return ", ".join(
+        f"scan{'s' * (len(frames) > 1)} {first_runs(sorted(frames), _NAMED)} {kind}"
+        for kind, frames in kinds.items()
+        if frames
     )
 
 
