@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from carlasc.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray
-from carlasc.core.geometry import DIRECTIONS, Transform, thin
+from carlasc.core.geometry import DIRECTIONS, Transform, poses_from, thin
 from carlasc.errors import FormatError
 from carlasc.inspection.findings import Finding, Severity
 from carlasc.motion.ground import ground_plane
@@ -152,10 +152,13 @@ def _mount(
     if 2 * len(grounds) <= len(scans):
         return None
     x, y, z = np.median(grounds, axis=0)
-    normal = np.array([-x, -y, 1.0]) / np.sqrt(x * x + y * y + 1)
+    slope = float(np.hypot(x, y))
     # whole tenths of a degree, so that other scans give the same rotation
-    degrees = round(float(np.rad2deg(np.arccos(normal[2]))), 1)
-    return Mount(up, axes, degrees, -float(z * normal[2]), _level(normal, degrees) @ turn)
+    degrees = round(float(np.rad2deg(np.arctan(slope))), 1)
+    half = np.deg2rad(degrees) / 2
+    along = np.array([-y, x, 0.0]) / max(slope, 1e-9)  # the axis of the smallest rotation to level
+    level = poses_from(np.array([[np.cos(half), *np.sin(half) * along]]), np.zeros((1, 3)))[0]
+    return Mount(up, axes, degrees, -float(z / np.hypot(1.0, slope)), level @ turn)
 
 
 def _ground(points: AnyFloatArray, steepest: float, certain: bool) -> FloatArray | None:
@@ -175,16 +178,6 @@ def _ground(points: AnyFloatArray, steepest: float, certain: bool) -> FloatArray
         if len(sectors) < _WIDE * _SECTORS or below > _BELOW:
             return None
     return plane
-
-
-def _level(normal: FloatArray, degrees: float) -> Transform:
-    """Return the smallest (4, 4) rotation of an upward direction to z, by this angle."""
-    turn, flat, angle = np.eye(4), np.hypot(normal[0], normal[1]), np.deg2rad(degrees)
-    if degrees:
-        x, y = normal[:2] / flat
-        axis = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0.0]])
-        turn[:3, :3] += np.sin(angle) * axis + (1 - np.cos(angle)) * axis @ axis
-    return turn
 
 
 def check_mount(mount: Mount | None, where: str, *, force: bool) -> list[Finding]:

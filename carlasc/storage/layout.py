@@ -350,7 +350,7 @@ class Metadata:
         """Height of the first sensor above the ground; None if it is not known."""
         sensors = self.extra.get("sensors")
         first = sensors[0] if isinstance(sensors, list) and sensors else None
-        height = first.get("height_m") if isinstance(first, dict) else None
+        height: Any = first.get("height_m") if isinstance(first, dict) else None
         is_number = isinstance(height, int | float) and not isinstance(height, bool)
         return float(height) if is_number else None
 
