@@ -72,7 +72,7 @@ def test_every_format_is_opened_with_its_classes_geometry_and_axes(name, files):
     )
 
 
-@pytest.mark.parametrize("name", ["challenge", "flashocc"])
+@pytest.mark.parametrize("name", ["challenge", pytest.param("flashocc", marks=pytest.mark.slow)])
 def test_predictions_of_occ3d_are_found_by_their_tokens(name, files):
     (sequence,) = carlasc.open(files(name)).sequences().values()
     assert sequence.frames("pred/labels").tolist() == [0, 1]
