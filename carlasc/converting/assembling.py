@@ -23,7 +23,7 @@ from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, LabelArray, 
 from carlasc.core.choices import Axes, CompareInputs
 from carlasc.core.choices import FlowSource as FlowSource  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import Images as Images  # noqa: PLC0414 (part of this module)
-from carlasc.core.classes import ClassTable, Remap
+from carlasc.core.classes import ClassTable, Remap, ids_in
 from carlasc.core.geometry import Transform, invert, mirror_points, transform_points
 from carlasc.errors import (
     ArgumentError,
@@ -144,7 +144,7 @@ class AxesAndClasses:
         if mapped.size and int(mapped.max()) == _UNKNOWN:
             unknown = mapped == _UNKNOWN
             if not self.allow_unknown:
-                counts = zip(*np.unique(labels[unknown], return_counts=True), strict=True)
+                counts = ids_in(labels[unknown]).items()
                 raise FormatError(
                     where,
                     expected=f"class ids of {self.source.name}",

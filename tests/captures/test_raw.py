@@ -194,7 +194,7 @@ INVALID = {  # folder -> (array that is written over it, what is expected and fo
         "labels0",
         np.full(300, 25, np.uint32),
         "class ids of carla",
-        "25 in 300 of 300",
+        r"25 \(300 times\) of 300",
     ),
     "short labels": (
         "labels0",

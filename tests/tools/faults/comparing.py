@@ -33,7 +33,7 @@ def content_of(folder: Path) -> Content:
 def is_record(path: Path) -> bool:
     """Whether a file is a record of inputs."""
     return path.suffix == ".json" and (
-        path.parent.name == RECORDS or path.match("carlasc-export-*.json")
+        path.parent.name == RECORDS or path.match("carlasc-*-of-*.json")
     )
 
 
