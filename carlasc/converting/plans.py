@@ -24,10 +24,10 @@ from carlasc.converting.chosen import ChosenFrames
 from carlasc.converting.plausibility import (
     POSE_S,
     Mount,
-    ScanCentres,
     are_posed,
     check_mount,
     check_scan,
+    check_standing,
     find_mount,
 )
 from carlasc.converting.protocol import Converter, FrameHandle, Recording, Trajectory
@@ -37,6 +37,7 @@ from carlasc.core.choices import SplitName as SplitName  # noqa: PLC0414 (part o
 from carlasc.core.frames import FrameRange, check_seconds
 from carlasc.core.geometry import invert, mirror_poses, relative_to
 from carlasc.core.grids import GridSpec, mirror_spec
+from carlasc.core.scans import ScanCentres
 from carlasc.errors import (
     ArgumentError,
     CarlascError,
@@ -108,6 +109,7 @@ class RecordingPlan(Examined):
         voxels: geometry of the recording's own voxel grids, right-handed, if they are written.
         force: whether estimated poses are accepted without a check.
         voxel_m: size of the voxels of the odometry; None: by the distances of points.
+        max_range_m: farther points are not used by the odometry; None: as the converter says.
         missing: numbers of the frames whose scan is not written yet.
         unfinished: numbers of the frames without a scan, or without the fields from the motion of
             actors.
@@ -122,6 +124,7 @@ class RecordingPlan(Examined):
     voxels: GridSpec | None = None
     force: bool = False
     voxel_m: float | None = None
+    max_range_m: float | None = None
     missing: set[int] = field(default_factory=set)
     unfinished: set[int] = field(default_factory=set)
     again: bool = False
@@ -310,7 +313,7 @@ def examine(
         notes.append("the positions of the sensor are not known, so no grids are made from scans")
     elif poses is None:
         why = "as requested" if options.source == KISS_ICP else "because the recording has none"
-        notes.append(f"poses are estimated from the scans with KISS-ICP, {why}")
+        notes.append(f"poses are estimated from the scans, {why}")
     else:
         if not known:
             try:
@@ -869,7 +872,7 @@ def follow(
             usable(),
             times=read_at,
             min_range_m=converter.min_range_m or 0.0,
-            max_range_m=converter.max_range_m or 100.0,
+            max_range_m=plan.max_range_m or converter.max_range_m or 100.0,
             voxel_m=plan.voxel_m,
             note=plan.notes.append,
         )
@@ -877,7 +880,7 @@ def follow(
         poses.append(pose)
         yield numbers[index], pose
     if poses and not plan.force:
-        centres.check(np.stack(poses), plan.recording.location)
+        check_standing(centres, np.stack(poses), plan.recording.location)
 
 
 def fill_gaps(poses: Mapping[int, FloatArray], recording: Recording) -> FloatArray:

@@ -8,12 +8,13 @@ sequence keeps.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from carlasc.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray
 from carlasc.core.geometry import DIRECTIONS, Transform, poses_from, thin
+from carlasc.core.scans import ScanCentres
 from carlasc.errors import FormatError
 from carlasc.inspection.findings import Finding, Severity
 from carlasc.motion.ground import ground_plane
@@ -39,9 +40,6 @@ _WIDE_M, _WIDE = 8.0, 0.3
 _NEAR_M, _BELOW_M, _BELOW = 15.0, 0.5, 0.02
 _SECTORS, _ON_GROUND_M = 36, 0.1
 _TILTED, _FALLEN = 5.0, 14.0  # degrees: grids, and the ground below the sensor, need less
-
-_CENTRE_M, _STANDING = 3.0, 0.2  # a scan that moves so far cannot belong to a sensor that stands
-_NEARER = 1.3  # factor by which the distance of the nearest points then changes
 
 
 def check_scan(points: Float32Array, seconds: AnyFloatArray | None, where: str) -> None:
@@ -194,38 +192,18 @@ def check_mount(mount: Mount | None, where: str, *, force: bool) -> list[Finding
     return [Finding(severity, "mount", where, expected, str(mount), advice)]
 
 
-@dataclass
-class ScanCentres:
-    """Where the points of the scans are, which shows whether a sensor moves."""
+def check_standing(centres: ScanCentres, poses: FloatArray, where: str) -> None:
+    """Check the (F, 4, 4) poses that odometry found of scans.
 
-    _centres: list[tuple[float, float, float]] = field(default_factory=list)
-
-    def add(self, points: AnyFloatArray) -> None:
-        """Add (N, 3) points of the next scan, N > 0."""
-        sample = points[:: max(1, len(points) // _SAMPLE)]
-        x, y = np.median(sample[:, :2], axis=0)
-        nearest = np.percentile(np.hypot(sample[:, 0], sample[:, 1]), 1)
-        self._centres.append((float(x), float(y), float(nearest)))
-
-    def check(self, poses: FloatArray, where: str) -> None:
-        """Check the (F, 4, 4) poses that odometry found of these scans.
-
-        Raises:
-            FormatError: the sensor stands, although its scans are taken from other and other
-                places.
-        """
-        centres, places = np.array(self._centres), poses[:, :2, 3]
-        part = max(1, len(centres) // 5)
-        first, last = np.median(centres[:part], axis=0), np.median(centres[-part:], axis=0)
-        moved = float(np.hypot(*(last - first)[:2]))
-        way = float(np.hypot(*(places - places[0]).T).max())
-        nearest = np.array([np.min(centres[:, 2]), np.max(centres[:, 2])]) + 1e-3
-        if moved > _CENTRE_M and way < _STANDING * moved and nearest[1] > _NEARER * nearest[0]:
-            raise FormatError(
-                where,
-                expected="scans in the frame of the sensor",
-                found=f"scans that stay where they are, while their centres move by {moved:.1f} m: "
-                f"they are in the world frame",
-                advice="transform them by the inverse of the pose of each scan, and give these "
-                "poses; or accept them with `force=True`",
-            )
+    Raises:
+        FormatError: the sensor stands, although its scans are taken from other and other places.
+    """
+    if moved_m := centres.moved_m(poses):
+        raise FormatError(
+            where,
+            expected="scans in the frame of the sensor",
+            found=f"scans that stay where they are, while their centres move by {moved_m:.1f} m: "
+            f"they are in the world frame",
+            advice="transform them by the inverse of the pose of each scan, and give these poses; "
+            "or accept them with `force=True`",
+        )

@@ -68,13 +68,6 @@ def static_structure(sequence: Sequence, frame: int) -> FloatArray:
     return structure_of(points, labels, flow, sequence.metadata.classes)
 
 
-def standing_points(sequence: Sequence, frame: int) -> AnyFloatArray:
-    """Read the (N, 3) points of a scan that do not move, as far as its flow tells, metres."""
-    points = np.asarray(sequence.read("points", frame))[:, :3]
-    flow = _per_point(sequence, "flow", frame, len(points))
-    return points if flow is None else points[(np.abs(flow) < _STANDS_M_S).all(axis=1)]
-
-
 def structure_of(
     points: AnyFloatArray,
     labels: AnyArray | None,
@@ -316,9 +309,13 @@ _LONG_PAIRS = 12
 # Scans over this distance overlap by at least a share, or by as much of the share of neighbours:
 # where a motion is missing in the poses, they do not.
 _LEAST, _ALIKE, _ENOUGH = 0.25, 0.62, 0.5
-# surfaces of one scan: size of the cells, least points, thickness, flatness, width, range
-_WALL_M, _WALL_POINTS, _THIN_M2, _FLAT, _WIDE_M2, _SURFACE_M = 1.0, 12, 0.06**2, 0.02, 0.02, 50.0
-_OPEN = 0.003  # share of the surfaces that face a direction, below which none determines it
+# surfaces of one scan: size of the cells, least points, thickness, flatness, width
+_WALL_M, _WALL_POINTS, _THIN_M2, _FLAT, _WIDE_M2 = 1.0, 12, 0.06**2, 0.02, 0.02
+# A position is determined where scans overlap less if they are moved by these distances: by any
+# factor where this share of the surfaces faces the direction, else by a factor; by a larger one
+# where the sensor stands, as the rays of a scan then end where those of the scan before ended.
+_SHIFTS_M = VOXEL_M * np.array([-4, -3, -2, -1, 1, 2, 3, 4])
+_FACING, _MOVED, _STOOD = 0.012, 1.05, 1.25
 
 
 @dataclass(frozen=True)
@@ -328,8 +325,8 @@ class LongOverlap:
     Attributes:
         share: mean share of a scan's structure that falls on that of the last scan within
             `REACH_M`; NaN if no scans have enough structure.
-        open_way: (2,) horizontal direction in the frame of the first scan, along which no surface
-            determines the position, as along a tunnel; None if there is none.
+        open_way: (2,) horizontal direction in the frame of the first scan, along which scans
+            overlap as well at other positions, as along a tunnel; None if there is none.
     """
 
     share: float
@@ -337,7 +334,7 @@ class LongOverlap:
 
     def is_wrong(self, near: float) -> bool:
         """Return whether a motion is missing: `near` is the share of neighbouring scans."""
-        return self.open_way is None and self.share < max(_LEAST, min(_ENOUGH, _ALIKE * near))
+        return self.share < max(_LEAST, min(_ENOUGH, _ALIKE * near))
 
     @property
     def why_untested(self) -> str:
@@ -345,42 +342,54 @@ class LongOverlap:
         if self.open_way is not None:
             x, y = self.open_way
             return (
-                f"no surface determines the position along (x, y) = ({x:.1f}, {y:.1f}) in the "
-                "frame of the first scan"
+                f"scans overlap as well when they are moved along (x, y) = ({x:.1f}, {y:.1f}) in "
+                "the frame of the first scan: no surface determines the position there, or the "
+                "poses are wrong"
             )
         return "" if self.share >= 0 else "scans have too few upright things"
 
 
-def measure_overlap(
-    structure: Callable[[int], FloatArray], points: Callable[[int], AnyFloatArray], poses: Poses
-) -> LongOverlap:
+def measure_overlap(structure: Callable[[int], FloatArray], poses: Poses) -> LongOverlap:
     """Measure the overlap of scans that are near each other under their poses but far in time, and
-    which directions their surfaces determine.
+    whether it determines their positions.
 
     Args:
         structure: returns the (M, 3) structure of the i-th scan.
-        points: returns its (N, 3) points on static things.
         poses: (F, 4, 4) first_T_sensor of each scan, in order of time; rigid.
     """
-    shares, facing = [], np.zeros((3, 3))
+    pairs, facing = [], np.zeros((2, 2))
     for first in np.unique(np.linspace(0, len(poses) - 2, _LONG_PAIRS).astype(int)).tolist():
         away = np.linalg.norm(poses[first:, :3, 3] - poses[first, :3, 3], axis=1) > REACH_M
         last = first + int(away.argmax()) if away.any() else len(poses) - 1
         target, moved = structure(first), _thin(structure(last), _OFFSET_POINTS)
-        if min(len(target), len(moved)) >= _MIN_POINTS:
-            shares.append(overlap(occupancy(target), relative(poses, first, last), moved))
-        own, here = points(first), poses[first : first + 1]
-        own = own[within(own, _INDOORS_M, _SURFACE_M)].astype(np.float32)
-        (block,) = blocks([own], here, _WALL_M, shift=0.0)
+        if min(len(target), len(moved)) < _MIN_POINTS:
+            continue
+        here, motion = poses[first : first + 1], relative(poses, first, last)
+        pairs.append((occupancy(target), motion, moved, here[0, :2, :3]))
+        (block,) = blocks([target.astype(np.float32)], here, _WALL_M, shift=0.0)
         _, spread = spread_of(block, here, 1)
         values, vectors = principal_axes(spread[block.sums[:, 0] >= _WALL_POINTS])
         thin, wide, _ = values.T
         flat = (thin < np.minimum(_FLAT * wide, _THIN_M2)) & (wide > _WIDE_M2)
-        normals = vectors[flat][:, :, 0]
+        normals = vectors[flat][:, :2, 0]
         facing += normals.T @ normals
-    ways, directions = np.linalg.eigh(facing[:2, :2])  # the ground determines the height
-    open_way = directions[:, 0] if ways[0] <= _OPEN * np.trace(facing) else None
-    return LongOverlap(float(np.mean(shares)) if shares else math.nan, open_way)
+    if not pairs:
+        return LongOverlap(math.nan)
+    ways, directions = np.linalg.eigh(facing)
+    way, shares, along = directions[:, 0], [], []
+    for occupied, motion, moved, first_T_here in pairs:
+        step = way @ first_T_here
+        shares.append(
+            [
+                overlap(occupied, translation(shift * step) @ motion, moved)
+                for shift in (0.0, *_SHIFTS_M)
+            ]
+        )
+        along.append(abs(step @ motion[:3, 3]))
+    own, *others = np.mean(shares, axis=0).tolist()
+    faced = ways[0] > _FACING * ways.sum()
+    needed = 1.0 if faced else _MOVED if np.median(along) > VOXEL_M else _STOOD
+    return LongOverlap(own, way if own < needed * max(others) else None)
 
 
 def choose_pairs(poses: Poses, max_pairs: int) -> list[tuple[int, int]]:

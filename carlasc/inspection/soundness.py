@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from carlasc.core.arrays import Float32Array, FloatArray
+from carlasc.core.scans import ScanCentres
 from carlasc.errors import ArgumentError, CarlascError
 from carlasc.inspection.findings import Finding, State
 from carlasc.motion.ground import ground_plane
@@ -39,8 +40,6 @@ _STEEPEST = 0.8  # greatest slope that is looked for
 _ABOVE_M = -0.05  # ground that is higher than this below the sensor is above it
 _SEEN = 0.5  # ground must be found in this share of the scans
 _EMPTY = 0.1  # greatest share of grids without an occupied voxel; fact: empty-grids
-# Scans that move so far while their poses stand are in one frame, which they were moved to.
-_CENTRE_M, _STANDING = 3.0, 0.2
 
 
 @dataclass
@@ -55,7 +54,7 @@ class ScanFacts:
     _scans: int = 0
     _far: list[float] = field(default_factory=list)
     _planes: list[FloatArray | None] = field(default_factory=list)
-    _centres: list[FloatArray] = field(default_factory=list)
+    _centres: ScanCentres = field(default_factory=ScanCentres)
 
     def add(self, points: Float32Array) -> None:
         """Add the (N, 3) points of the next scan, metres, finite."""
@@ -65,7 +64,7 @@ class ScanFacts:
             self._far.append(float((np.abs(points).max(axis=1) > _FAR_M).mean()))
             plane = ground_plane(points)
             self._planes.append(ground_plane(points, _STEEPEST) if plane is None else plane)
-            self._centres.append(np.median(points[:, :2], axis=0).astype(np.float64))
+            self._centres.add(points)
 
     def made(self, sequence: Sequence) -> list[str]:
         """Return those of `CHECKS` that `findings` makes."""
@@ -91,23 +90,17 @@ class ScanFacts:
         if (far := float(np.mean(self._far))) > _FEW:
             found = f"{far:.1%} of the points more than {_FAR_M:g} m away"
             yield Finding("error", RANGE, where, CHECKS[RANGE], found, _FRAMES)
-        elif self._is_moved(sequence):
-            found = "points that move by metres while the poses stand"
+        elif moved_m := self._moved_m(sequence):
+            found = f"points that move by {moved_m:.1f} m while the poses stand"
             yield Finding("error", RANGE, where, CHECKS[RANGE], found, _FRAMES)
         if sequence.metadata.has_rays:
             yield from self._ground(where)
 
-    def _is_moved(self, sequence: Sequence) -> bool:
-        """Return whether the points move although the poses stand."""
-        part = max(1, len(self._centres) // 5)
-        first, last = np.median([self._centres[:part], self._centres[-part:]], axis=1)
+    def _moved_m(self, sequence: Sequence) -> float:
         try:
-            places = sequence.poses[:, :2, 3]
+            return self._centres.moved_m(sequence.poses)
         except CarlascError:  # which is reported elsewhere
-            return False
-        moved = np.linalg.norm(last - first)
-        way = np.linalg.norm(places - places[:1], axis=1).max(initial=0.0)
-        return bool(moved > _CENTRE_M and way < _STANDING * moved)
+            return 0.0
 
     def _ground(self, where: str) -> Iterator[Finding]:
         planes = np.array([plane for plane in self._planes if plane is not None]).reshape(-1, 3)

@@ -26,7 +26,6 @@ from carlasc.inspection.alignment import (
     PoseDiagnosis,
     diagnose_poses,
     measure_overlap,
-    standing_points,
     static_structure,
 )
 from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values
@@ -371,7 +370,7 @@ def _diagnose_poses(sequence: Sequence) -> tuple[PoseDiagnosis, LongOverlap] | t
     if seconds is not None and not (np.diff(seconds) > 0).all():
         seconds = None  # which is reported elsewhere
     found = diagnose_poses(structure, poses, points=reading(feed.static_points), seconds=seconds)
-    return found, measure_overlap(structure, reading(partial(standing_points, sequence)), poses)
+    return found, measure_overlap(structure, poses)
 
 
 def _judge_grid(

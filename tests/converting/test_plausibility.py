@@ -16,14 +16,15 @@ import carlasc
 from carlasc.cli import app
 from carlasc.converting import Cloud, LayoutOptions, Trajectory, convert, preview
 from carlasc.converting.plausibility import (
-    ScanCentres,
     are_posed,
     check_mount,
     check_scan,
+    check_standing,
     find_mount,
 )
 from carlasc.core import translation
 from carlasc.core.geometry import invert, transform_points
+from carlasc.core.scans import ScanCentres
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.motion import PoseOptions
 from carlasc.running import Run
@@ -120,10 +121,10 @@ def test_a_sensor_that_stands_although_its_scans_move_is_refused(world, speed, m
     standing = np.tile(np.eye(4), (drive.frames, 1, 1))
     if moves:
         with raises(FormatError, where="drive", found="centres move", advice="force"):
-            centres.check(standing, "drive")
-        centres.check(drive.world_T_vehicle(drive.times), "drive")
+            check_standing(centres, standing, "drive")
+        check_standing(centres, drive.world_T_vehicle(drive.times), "drive")
     else:
-        centres.check(standing, "drive")
+        check_standing(centres, standing, "drive")
 
 
 class Mounted(DriveConverter):
