@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from carlasc.inspection.heldout_scores import HeldOutScores, RayShares
 
 _SHOWN = 3
+_SAMPLE = 20  # frames of each grid that are made again with --full
 _COLORS = {"error": "red", "warning": "yellow", "note": "cyan"}
 
 
@@ -60,7 +61,14 @@ def validate(
     *,
     source: SourceArgument = ".",
     options: Annotated[Given, Library("carlasc.validate")],
-    full: Annotated[bool, typer.Option("--full", help="Read the contents of all frames.")] = False,
+    full: Annotated[
+        bool,
+        typer.Option(
+            "--full",
+            help="Read the contents of all frames, and make 20 frames of each grid again, or "
+            "--sample of them.",
+        ),
+    ] = False,
     everything: Annotated[
         bool,
         typer.Option("--all", help="Print all findings, not only the first three of each kind."),
@@ -99,7 +107,8 @@ def validate(
         observe = scans.make(motion=motion.make(), poses=carlasc.motion.PoseOptions("file"))
     rays = None
     with work.spread("Validating", "steps", usual=1) as run:
-        result = options.make(source, **({"every": 1} if full else {}), run=run)
+        more = {"every": 1, "sample": options.values.get("sample", _SAMPLE)} if full else {}
+        result = options.make(source, **more, run=run)
     if holdout.holdout:
         left_out = holdout.holdout_every or carlasc.inspection.EVERY
         with work.spread("Leaving scans out") as run:

@@ -12,7 +12,8 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -21,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from carlasc.core.arrays import AnyArray, IntArray
-from carlasc.errors import CompleteError, ConflictError, MissingDataError
+from carlasc.errors import CarlascError, CompleteError, ConflictError, MissingDataError
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.copying import UnpackResult, refuse_overlap, unpack
@@ -207,7 +208,8 @@ class DerivedCopy:
             if not overwrite and has_content(record := Path(out) / _RECORD):
                 check_complete(out, record.read_bytes() == to_json(settings))
             _clear(Path(out), kind, is_kind, overwrite=overwrite)
-            self.mark = _mark(unfinished(Path(out)), settings, overwrite=overwrite)
+            with _naming_replaced(Path(out)):
+                self.mark = _mark(unfinished(Path(out)), settings, overwrite=overwrite)
 
     def writer(self, path: str) -> SequenceWriter | None:
         """Return the writer for data derived from a sequence, kept until the copy is complete; None
@@ -230,7 +232,9 @@ class DerivedCopy:
             folder = Path(self.out) if self.mark is None else unfinished(Path(self.out))
             linked = sum(_link_files(one, folder / path) for path, one in sequences.items())
         chosen = ChosenSequences(self.source.location, sequences)
-        copied = unpack(chosen, self.out, overwrite=self.overwrite and self.mark is None, run=run)
+        aside = self.overwrite and self.mark is None
+        with _naming_replaced(Path(self.out)):
+            copied = unpack(chosen, self.out, overwrite=aside, run=run)
         if self.mark is not None:
             for path in sequences:
                 shutil.rmtree(Path(self.out) / path / layout.DERIVED, ignore_errors=True)
@@ -244,6 +248,18 @@ class DerivedCopy:
             linked=linked,
             left_out=sorted({name for one in sequences.values() for name in one.left_out}),
         )
+
+
+@contextmanager
+def _naming_replaced(out: Path) -> Iterator[None]:
+    """Say in errors where the older copy is that was moved aside."""
+    try:
+        yield
+    except CarlascError as error:
+        if replaced(out).exists() and not out.exists():
+            where = f"the data set that was in {out.name} is in {replaced(out)}"
+            error.advice = "; ".join(part for part in (error.advice, where) if part)
+        raise
 
 
 def check_complete(out: AnyPath, is_complete: bool) -> None:

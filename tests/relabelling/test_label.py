@@ -225,6 +225,15 @@ def test_what_exists_is_not_replaced_unless_it_was_labelled_and_that_is_asked_fo
             carlasc.label(data, place, tmp_path / "net", overwrite=True, run=ALONE)
 
 
+def test_an_error_says_where_the_replaced_data_set_is(data, predictions, tmp_path):
+    carlasc.label(data, tmp_path / "out", tmp_path / "net", run=ALONE)
+    (tmp_path / "out.part").mkdir()  # of another run, which lost its mark
+    with pytest.raises(ConflictError) as error:
+        carlasc.label(data, tmp_path / "out", tmp_path / "net", overwrite=True, run=ALONE)
+    assert error.value.advice.endswith(str(tmp_path / "out.replaced"))
+    assert open_store(tmp_path / "out.replaced").sequences()[WHOLE].metadata.predicted
+
+
 KILLED = """
 import os, sys
 from carlasc import Run, label
