@@ -97,15 +97,13 @@ def write_scans(drive: SimulatedDrive, folder: Path) -> FloatArray:
     """
     (folder / "scans").mkdir(parents=True)
     poses = np.stack([world_T_sensor(drive, frame) for frame in range(drive.frames)])
-    lines = []
-    for frame, seconds in enumerate(drive.times + _START_S):
+    times = drive.times + _START_S
+    for frame, seconds in enumerate(times):
         scan = drive.scan(frame)
         order = np.argsort(scan.seconds, kind="stable")
         table = np.column_stack([scan.points, scan.seconds])[order].astype(np.float32)
         rows = table.view([(name, "<f4") for name in ("x", "y", "z", "intensity", "t")])
         np.save(folder / "scans" / f"{seconds:.9f}.npy", rows[:, 0])
-        w, *xyz = quaternions_of(poses[frame : frame + 1, :3, :3])[0]
-        numbers = seconds, *poses[frame, :3, 3], *xyz, w
-        lines.append(" ".join(f"{number:.9f}" for number in numbers))
-    (folder / "poses.txt").write_text("\n".join(lines) + "\n", "utf-8")
+    turns = quaternions_of(poses[:, :3, :3])[:, [1, 2, 3, 0]]
+    np.savetxt(folder / "poses.txt", np.column_stack([times, poses[:, :3, 3], turns]), fmt="%.9f")
     return relative_to(poses[0], poses)
