@@ -46,7 +46,9 @@ _LEAST_CONFIDENCE = 0.5  # of an actor
 _STAYS_M, _SENSOR_PATH_M = 0.5, 1.0  # points that move with the sensor, while it drives so far
 _LINE_SLOPE = 0.004  # a quarter of a degree: the points of one scan line differ by less
 # Parts of the recording vehicle: cells around the sensor in which nearly all scans have points,
-# often at places that were free at other times; and cells beside them with such points.
+# often at places that were free at other times; and cells beside them with such points. Deskewing
+# moves such parts by decimetres whenever the speed changes, so that they do not look rigid: they
+# cannot be told from a person who walks beside the sensor at exactly its pace.
 _ALWAYS, _FREED, _OFTEN = 0.95, 0.3, 0.3
 _BESIDE_M = 1.8  # farther beside the way of the sensor, another vehicle may drive along
 _OWN_SHARE = 0.5  # an actor with so many points in these cells is none

@@ -45,8 +45,8 @@ def _poses(values: FloatArray) -> FloatArray:
 
 def _along(way: Mapping[str, Sequence[float]], at: FloatArray) -> FloatArray:
     """Return the (..., 4, 4) poses on a way at some times."""
-    rows = [way.get(name, np.zeros(5)) for name in ("x", "y", "z", "roll", "pitch", "yaw")]
-    start, speed, amplitude, rate, phase = np.transpose(rows)
+    rows = [way.get(name, [0.0] * 5) for name in ("x", "y", "z", "roll", "pitch", "yaw")]
+    start, speed, amplitude, rate, phase = np.array(rows).T
     line = start + speed * at[..., None]
     line[..., 2] = line[..., 2].clip(0.0)  # stairs begin on the ground
     return _poses(line + amplitude * np.sin(rate * at[..., None] + phase))
