@@ -327,8 +327,7 @@ class _ExportedFrom:
         self._exporter, self._sequence = exporter, exported.sequence
         self._folder, self._writer = root / exported.folder, _RootFiles(root)
         self._label = f"{label}-{run.part.number}-of-{run.part.count}"
-        self._before = MadeFrom.read(self._writer, self._label)
-        self._now: MadeFrom | None = None
+        self._before = self._now = MadeFrom.read(self._writer, self._label)
         self.is_known, self.changed = bool(self._before.whole), False
         if compare != "never":
             sequence = self._sequence
@@ -349,8 +348,7 @@ class _ExportedFrom:
 
     def why(self, exported: Exported) -> str:
         """Return why the sequence is exported again."""
-        own = {} if self._now is None else self._now.own
-        why = describe_changes(self._before.own, own) or "its text files changed"
+        why = describe_changes(self._before.own, self._now.own) or "its text files changed"
         return made_again(exported.frames, why)
 
     def _files(self, frame: int) -> str:
@@ -364,15 +362,14 @@ class _ExportedFrom:
         export has no longer.
         """
         left = {str(frame) for frame in self._exporter.frames(self._sequence)}
-        texts = set() if self._now is None else set(self._now.frames[_TEXTS].splitlines())
+        texts = set(self._now.frames[_TEXTS].splitlines())
         for frame, files in self._before.frames.items():
             for file in () if frame in left else set(files.splitlines()) - texts:
                 (self._folder / file).unlink(missing_ok=True)
 
     def write(self) -> None:
         """Write the record."""
-        if self._now is not None:
-            self._now.write(self._writer, self._label)
+        self._now.write(self._writer, self._label)
 
 
 @dataclass(frozen=True)

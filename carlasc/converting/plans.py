@@ -31,7 +31,7 @@ from carlasc.converting.plausibility import (
     find_mount,
 )
 from carlasc.converting.protocol import Converter, FrameHandle, Recording, Trajectory
-from carlasc.core.arrays import Float32Array, FloatArray, IntArray
+from carlasc.core.arrays import Float32Array, FloatArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.choices import SplitName as SplitName  # noqa: PLC0414 (part of this module)
 from carlasc.core.frames import FrameRange, check_seconds
@@ -43,7 +43,7 @@ from carlasc.errors import (
     ConflictError,
     FormatError,
     MissingDataError,
-    first_names,
+    first_runs,
 )
 from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses, structure_of
 from carlasc.inspection.findings import Finding
@@ -296,7 +296,7 @@ def examine(
             chosen = [handle for handle, there in zip(chosen, posed, strict=True) if there]
             notes.append(
                 f"{np.count_nonzero(~posed)} of {len(posed)} scans have no pose at their time, and "
-                f"are left out: {_ranges(numbers[~posed])}"
+                f"are left out: {first_runs(numbers[~posed].tolist())}"
             )
     if len(chosen) < len(recording.frames):
         recording = ChosenFrames(recording, chosen)
@@ -345,14 +345,6 @@ def _swapped(given: Trajectory) -> Trajectory | None:
     if given.other is None:
         return None
     return replace(given, world_T_vehicle=given.other, other=None)
-
-
-def _ranges(numbers: IntArray) -> str:
-    """Return some increasing numbers as ranges: "0 to 3, 7"."""
-    parts = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
-    return first_names(
-        f"{part[0]} to {part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts
-    )
 
 
 def _some_scans(recording: Recording) -> list[Float32Array]:

@@ -368,11 +368,13 @@ class Failure:
         sequence: location of its sequence in the source.
         frame: its number.
         message: the error, in one line.
+        waits: whether it only waits for another frame, which failed.
     """
 
     sequence: str
     frame: int
     message: str
+    waits: bool = False
 
 
 def check_outside(out: Path, source: str) -> None:

@@ -485,6 +485,7 @@ class Conversion:
                 plan.recording.location,
                 number,
                 f"{plan.recording.location}: frame {number} waits for {waits_for(failed)}",
+                waits=True,
             )
             for number, failed in sorted(waiting.items())
             if number in todo

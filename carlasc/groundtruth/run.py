@@ -36,7 +36,6 @@ from carlasc.errors import (
     check_types,
     reading,
 )
-from carlasc.groundtruth.comparing import InputCheck
 from carlasc.groundtruth.from_capture import capture_sequences
 from carlasc.groundtruth.from_grid import resampled_sequences
 from carlasc.groundtruth.from_scans.sequences import scan_sequences
@@ -44,6 +43,7 @@ from carlasc.groundtruth.inputs import (
     FrameData,
     FrameInput,
     GridPlan,
+    InputCheck,
     SequenceInput,
     StoredSequence,
 )
@@ -604,7 +604,7 @@ class SequenceJob:
                 self.plan,
                 inputs.metadata.classes,
                 number in sampled,
-                number in self.check.replaced,
+                number in self.check.stale,
                 existing,
             )
             for number in sorted(numbers)
@@ -674,7 +674,7 @@ class Work:
         def batches() -> Iterator[Batch]:
             for job, todo, missing in zip(self.jobs, every, ours, strict=True):
                 if missing:
-                    job.check.prepare(self.spread, steps)
+                    job.inputs.prepare(job.writer, self.spread, steps)
                     job.check.begin(job.numbers, todo)
                 for batch in _batches(job, job.tasks(missing)):
                     under_way.append(job)
@@ -717,13 +717,14 @@ class Work:
         is_reported &= not made and not job.check.changed
         if not (is_reported or (self.spread.part.count > 1 and job.missing())):
             self._report(job, made, tried)
+        if job.check.must_record and not made:
+            job.check.begin(job.numbers, ())
         if made or job.check.must_record:
-            job.check.begin(job.numbers, ())  # if no frame was made
             job.check.finish({done.task.number for done in made if done.error is None})
 
     def _report(self, job: SequenceJob, made: list[FrameResult], tried: Set[int]) -> None:
         """Write the report of a sequence."""
-        job.check.prepare(self.spread, StepCounter(None))
+        job.inputs.prepare(job.writer, self.spread, StepCounter(None))
         self.has_written = True
         measured = _batches(job, job.tasks(job.reported - tried, job.writer))
         with closing(run_all(run_batch, measured, self.spread, lost=fail_batch)) as results:

@@ -20,11 +20,11 @@ from typing import TypeAlias
 import numpy as np
 
 from carlasc.core.arrays import AnyArray, AnyFloatArray, BoolArray, FloatArray
+from carlasc.core.cells import warped_voxels
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, choices_of_axes, invert, transform_points, translation
 from carlasc.core.grids import GridSpec
 from carlasc.errors import CarlascError
-from carlasc.inspection.points_in_voxels import warped_voxels
 from carlasc.inspection.pose_quality import PoseQuality, angles_of, measure_poses
 from carlasc.motion.joint_alignment import blocks, spread_of
 from carlasc.motion.solving import principal_axes

@@ -78,10 +78,10 @@ def measure_poses(
     numbers = np.arange(len(poses), dtype=np.float64)
     for first in _choose_runs(poses, times):
         rows = slice(first, first + _RUN)
-        scans = [
-            ThinnedScan.of(points(row).astype(np.float32), poses[row])
-            for row in range(len(poses))[rows]
-        ]
+        scans = list[ThinnedScan]()
+        for row in range(len(poses))[rows]:  # in Python 3.11, a comprehension is a level of calls
+            thinned = ThinnedScan.of(points(row).astype(np.float32), poses[row])
+            scans.append(thinned)
         used, measured = [scan.used for scan in scans], [scan.measured for scan in scans]
         was = finite_mean(disagreement(measured, poses[rows]))
         aligned = align(used, poses[rows], poses[rows])

@@ -8,13 +8,10 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from carlasc.captures.raw import RAW, Capture
+from carlasc.captures.raw import RAW, Capture, CaptureFiles
 from carlasc.core.frames import FrameRange
 from carlasc.errors import CarlascError
-from carlasc.groundtruth.from_capture import CaptureFiles
-from carlasc.groundtruth.run import FrameTask
 from carlasc.inspection.findings import Finding, Severity
-from carlasc.inspection.reports import inputs_of
 from carlasc.running.spreading import Run
 from carlasc.storage.folder import FolderSequence
 from carlasc.storage.inputs import (
@@ -66,6 +63,9 @@ def check_sample(sequence: Sequence, count: int, run: Run) -> Iterator[Finding]:
     """Make some frames of each grid again from the scans beside it, and yield a finding for each
     grid with a frame that differs, and a note for each that was compared.
     """
+    from carlasc.groundtruth.run import FrameTask  # compiled code, which `info` does not need
+    from carlasc.inspection.reports import inputs_of
+
     for grid in sequence.grids:
         inputs, where = inputs_of(sequence, grid), f"{sequence.location}/{grid}"
         frames = sequence.frames(f"{grid}/labels")

@@ -18,13 +18,13 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from hashlib import blake2b
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from carlasc.core.arrays import AnyArray
 from carlasc.core.choices import CompareInputs
-from carlasc.core.plain import from_plain
-from carlasc.errors import CarlascError, count, first_names, reading
+from carlasc.errors import CarlascError, count, first_names, first_runs
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
@@ -213,13 +213,18 @@ def sequence_states(source: Source, *more: str) -> dict[str, str]:
 
 def _read_rows(writer: SequenceWriter, document: str) -> dict[int, tuple[str, str]]:
     """Return the rows of a table of digests; empty without one, or with one of another version."""
+    with suppress(KeyError, ValueError, TypeError, AttributeError):
+        rows = _read_record(writer, document)["frames"]
+        return {int(frame): (state, digest) for frame, (state, digest) in rows.items()}
+    return {}
+
+
+def _read_record(writer: SequenceWriter, document: str) -> dict[str, Any]:
+    """Return the content of a record; empty without one, or with one of another version."""
     data = writer.read_document(document)
     with suppress(CarlascError):
         values = {} if data is None else parse_json(data, document)
-        if values.get("format") == _FORMAT:
-            with reading(document, "a table of digests"):
-                rows = from_plain(values["frames"], dict[str, tuple[str, str]], "frames")
-                return {int(frame): row for frame, row in rows.items()}
+        return values if values.pop("format", None) == _FORMAT else {}
     return {}
 
 
@@ -232,26 +237,20 @@ class MadeFrom:
         own: digest of the own files, the pose and the time of each frame of the input.
         frames: digest of everything that a frame of the output was made from; empty while a frame
             that exists is made again.
-        replaced: frames whose scans are written again, because those of the input changed.
     """
 
     whole: str = ""
     own: dict[str, str] = field(default_factory=dict)
     frames: dict[str, str] = field(default_factory=dict)
-    replaced: tuple[int, ...] = ()
 
     @classmethod
     def read(cls, writer: SequenceWriter, output: str) -> MadeFrom:
         """Return the record of an output; an empty one without any, or with one that cannot be
         read.
         """
-        name = layout.record_file(output)
-        data = writer.read_document(name)
-        with suppress(CarlascError):
-            values = {} if data is None else parse_json(data, name)
-            if values.pop("format", None) == _FORMAT:
-                with reading(name, "a record of inputs"):
-                    return from_plain(values, cls, "record")
+        with suppress(KeyError, ValueError, TypeError):
+            values = _read_record(writer, layout.record_file(output))
+            return cls(str(values["whole"]), dict(values["own"]), dict(values["frames"]))
         return cls()
 
     def write(self, writer: SequenceWriter, output: str) -> None:
@@ -309,22 +308,10 @@ def describe_changes(old: Mapping[str, str], new: Mapping[str, str]) -> str:
         "added": list(map(int, new.keys() - old.keys())),
         "removed": list(map(int, old.keys() - new.keys())),
     }
-    parts = [f"{_named(frames)} {kind}" for kind, frames in kinds.items() if frames]
-    return ", ".join(parts)
-
-
-def _named(frames: Collection[int]) -> str:
-    """Return "scan 12", or "scans 3, 7 to 9 and 20 more"."""
-    spans = list[list[int]]()
-    for frame in sorted(frames):
-        if spans and frame == spans[-1][1] + 1:
-            spans[-1][1] = frame
-        else:
-            spans.append([frame, frame])
-    texts = [str(a) if a == b else f"{a} to {b}" for a, b in spans[:_NAMED]]
-    left = len(frames) - sum(b - a + 1 for a, b in spans[:_NAMED])
-    return f"scan{'s' * (len(frames) > 1)} {', '.join(texts)}" + (
-        f" and {left} more" if left else ""
+    return ", ".join(
+        f"scan{'s' * (len(frames) > 1)} {first_runs(sorted(frames), _NAMED)} {kind}"
+        for kind, frames in kinds.items()
+        if frames
     )
 
 

@@ -576,6 +576,12 @@ class SceneReader:
         return self.data.shown or self.data.stored_table
 
     @property
+    def shows_ego(self) -> bool:
+        """Whether a plain car can be drawn at the sensor: not in grids with another frame."""
+        sequence = self.data.sequence
+        return not isinstance(sequence, VoxelSequence) or sequence.is_at_sensor
+
+    @property
     def table_use(self) -> TableUse:
         """The class table of the labels as they are stored, and what named it."""
         if self.data.stored is not None:

@@ -259,7 +259,7 @@ def test_only_named_sequences_are_scored_and_those_without_truth_are_listed(town
         evaluate(tmp_path, truth, sequences=["Town1"])
 
 
-@pytest.mark.parametrize("form", ["challenge", "flashocc"])
+@pytest.mark.parametrize("form", ["challenge", pytest.param("flashocc", marks=pytest.mark.slow)])
 def test_predictions_of_occ3d_are_scored_by_tokens_with_the_mask_of_cameras(form, tmp_path):
     truth = foreign.write_occ3d(tmp_path / "occ3d")
     pred = foreign.WRITERS[form](tmp_path / form, tokens=("aa0", "bb1", "zz9"))

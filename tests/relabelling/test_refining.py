@@ -102,9 +102,9 @@ def data(exact, truth, tmp_path):
     shutil.copytree(exact / ONE, tmp_path / "data" / TWO, copy_function=os.link)
     shutil.copytree(exact / ONE, tmp_path / "data" / ONE, copy_function=os.link)
     write_poses(tmp_path / "data" / ONE, disturbed(truth))
-    (tmp_path / "data" / ONE / "carlasc.json").write_text(
-        '{"format": 2, "sensor": "a", "poses": "file"}'
-    )
+    described = tmp_path / "data" / ONE / "carlasc.json"
+    described.unlink()  # it is a link
+    described.write_text('{"format": 2, "sensor": "a", "poses": "file"}')
     return tmp_path / "data"
 
 
@@ -148,7 +148,13 @@ def test_carlasc_json_says_what_was_done_and_keeps_what_it_said(data, tmp_path):
         "sensor": "a",
         "poses": "file, refined",
     }
-    assert found[1] == {"format": 2, "axes": "left", "classes": "carla", "poses": "left as given"}
+    assert found[1] == {
+        "format": 2,
+        "axes": "left",
+        "classes": "carla",
+        "simulated": True,
+        "poses": "left as given",
+    }
     again = carlasc.refine(tmp_path / "out", tmp_path / "again", run=ALONE)
     assert again.refined == []
     for path in (ONE, TWO):

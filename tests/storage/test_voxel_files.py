@@ -72,7 +72,7 @@ def test_every_format_is_opened_with_its_classes_geometry_and_axes(name, files):
     )
 
 
-@pytest.mark.parametrize("name", ["challenge", "flashocc"])
+@pytest.mark.parametrize("name", ["challenge", pytest.param("flashocc", marks=pytest.mark.slow)])
 def test_predictions_of_occ3d_are_found_by_their_tokens(name, files):
     (sequence,) = carlasc.open(files(name)).sequences().values()
     assert sequence.frames("pred/labels").tolist() == [0, 1]
@@ -159,3 +159,21 @@ def test_files_of_other_programs_are_counted_and_shown(files, tmp_path):
     assert carlasc.info(root).sequences[0].grids[0].size == (200, 200, 16)
     page = carlasc.view(root, tmp_path / "page.html")
     assert page.source_classes.table == "openoccupancy" and page.size_bytes > 1e5
+
+
+def test_an_id_of_the_table_is_no_ignored_voxel(tmp_path):
+    folder = tmp_path / "sequences/00/voxels"
+    folder.mkdir(parents=True)
+    labels = np.zeros(256 * 256 * 32, "<u2")
+    labels[:3] = 40, 255, 255  # 255: a moving motorcyclist in the raw ids of SemanticKITTI
+    labels.tofile(folder / "000000.label")
+    (sequence,) = carlasc.open(tmp_path).sequences().values()
+    grid = sequence.grid("voxels", 0)
+    assert grid.known.all() and grid.labels.ravel()[:4].tolist() == [40, 255, 255, 0]
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"), [("preprocessed", True), ("occ3d", False), ("surroundocc", False)]
+)
+def test_a_car_is_drawn_only_where_the_sensor_is_the_origin_and_x_is_forward(name, shown, files):
+    assert carlasc.Scene(files(name)).open().shows_ego is shown

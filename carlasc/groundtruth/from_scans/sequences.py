@@ -158,6 +158,7 @@ class ScanSequence(StoredSequence):
         self.options = options
         self.actors = MovingActors()
         self.refined: RefinedPoses | None = None
+        self._is_prepared = False
 
     @cached_property
     def estimates_poses(self) -> bool:
@@ -251,6 +252,9 @@ class ScanSequence(StoredSequence):
         """Refine the poses of the sequence, and find its actors, or read the results of an earlier
         run with `writer`.
         """
+        if self._is_prepared:
+            return
+        self._is_prepared = True
         if self.refines:
             self.use_refined(refine_sequence(self.feed, writer, run, steps))
         if self.feed.needs_actors:

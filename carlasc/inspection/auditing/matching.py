@@ -39,7 +39,7 @@ from carlasc.storage import as_source, layout
 from carlasc.storage.files import parse_json
 from carlasc.storage.layout import identity_of
 from carlasc.storage.protocol import Sequence
-from carlasc.storage.voxel_files import IGNORED_ID, GridFrames, VoxelFrames
+from carlasc.storage.voxel_files import GridFrames, VoxelFormat, VoxelFrames, is_counted
 
 _SAME_TIME_S = 0.06  # a grid belongs to a scan if their times differ by less; fact: same-time
 _HEIGHT_M = 1.8  # height of the sensor above the ground in CarlaSC, used if the recording has none
@@ -105,12 +105,12 @@ class MatchedGrids:
     @property
     def frame_name(self) -> str:
         """The frame of the grids in words."""
-        return f"{self._format_place}; {self.axes}-handed"
+        format, place = self._format, "the sensor, x forward"
+        return f"{place if format is None else format.place}; {self.axes}-handed"
 
     @property
-    def _format_place(self) -> str:
-        grids = self.grids
-        return grids.format.place if isinstance(grids, VoxelFrames) else "the sensor, x forward"
+    def _format(self) -> VoxelFormat | None:
+        return self.grids.format if isinstance(self.grids, VoxelFrames) else None
 
     @cached_property
     def grid_T_scan(self) -> Transform:
@@ -118,7 +118,7 @@ class MatchedGrids:
         matrix: Transform = np.diag(
             [1.0, 1.0 if self.axes == self.scans.metadata.axes else -1.0, 1.0, 1.0]
         )
-        if "y forward" in self._format_place:
+        if self._format is not None and self._format.y_forward:
             matrix = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ matrix
         matrix[2, 3] = self.height_m
         return matrix
@@ -174,8 +174,8 @@ class MatchedGrids:
             raise FormatError(where, expected=expected, found=str(labels.size), advice=advice)
         labels = labels.reshape(self.spec.size)
         occupied = labels != (0 if self.grids.classes is None else self.grids.classes.free)
-        if isinstance(self.grids, VoxelFrames):
-            occupied &= labels != IGNORED_ID
+        if isinstance(self.grids, VoxelFrames) and self.grids.classes is not None:
+            occupied &= is_counted(labels, self.grids.classes)
         if self._many_to_one:
             labels = CARLAOCC_TO_CARLA(labels, where)
         if known is not None:
@@ -337,7 +337,7 @@ def _token_times(grids: VoxelFrames) -> dict[str, float] | None:
     the scene or one above it.
     """
     folder = Path(grids.location)
-    for place in (folder, folder.parent, folder.parent.parent):
+    for place in (folder, *list(folder.parents)[:3]):
         if (file := place / _TIMES).is_file():
             with reading(file, "lines of a token and seconds"):
                 rows = [line.split() for line in file.read_text().splitlines() if line.strip()]
