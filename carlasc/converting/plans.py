@@ -263,15 +263,15 @@ def examine(
     notes, findings = list[str | None](), list[Finding]()
     checked = recording.rays and (level or not known)
     mount = find_mount(_some_scans(recording)) if checked else None
-    if level and mount is None:
-        raise FormatError(
-            recording.location, expected="ground in the scans, to turn them upright", found="none"
-        )
-    if level and mount is not None:
+    if not level:
+        findings += check_mount(mount, recording.location, force=False)
+    elif mount is not None:
         recording = _upright(recording, converter, mount, options)
         notes.append(f"scans were turned upright: they show {mount}")
     else:
-        findings += check_mount(mount, recording.location, force=False)
+        raise FormatError(
+            recording.location, expected="ground in the scans, to turn them upright", found="none"
+        )
     own_times = recording.times()
     times = frame_times(recording, own_times)
     trajectory = read_trajectory(recording, options)
@@ -331,11 +331,9 @@ def examine(
                     findings.append(Finding.from_error("poses-on-scans", recording.location, error))
         numbers = np.array([handle.number for handle in chosen])
         if jump := describe_jumps(numbers, poses[numbers], times[numbers]):
+            where, expected = recording.location, "poses without jumps"
             advice = f"check whether the poses belong to these scans, or {_ESTIMATE}"
-            expected = "poses without jumps"
-            findings.append(
-                Finding("warning", "pose-jump", recording.location, expected, jump, advice)
-            )
+            findings.append(Finding("warning", "pose-jump", where, expected, jump, advice))
         notes.append(jitter_note(poses))
     if own_times is None and recording.rays:
         notes.append("there are no times: frames are taken to be 0.1 s apart")
@@ -358,11 +356,8 @@ def _some_scans(recording: Recording) -> list[Float32Array]:
     Raises:
         FormatError: none of them is a scan: the error of the first one.
     """
-    rig, scans, frames = (
-        replace(Rig.of(recording), rays=False),
-        list[Float32Array](),
-        recording.frames,
-    )
+    rig, frames = replace(Rig.of(recording), rays=False), recording.frames
+    scans = list[Float32Array]()
     problem: FormatError | None = None
     for row in sorted({*np.linspace(0, len(frames) - 1, _SCANS).astype(int).tolist()}):
         with suppress(CarlascError, OSError):  # the conversion of the frame reports the error

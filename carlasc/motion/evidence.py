@@ -34,15 +34,7 @@ from carlasc.core.arrays import (
     LabelArray,
     Uint32Array,
 )
-from carlasc.core.cells import (
-    Pose,
-    as_pose,
-    distinct,
-    fast_azimuth,
-    first_of_cells,
-    numbered,
-    transform,
-)
+from carlasc.core.cells import Pose, as_pose, distinct, fast_azimuth, numbered, transform
 from carlasc.core.compiling import cached, inlined
 from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
 from carlasc.core.scans import finite, runs_of_origins
@@ -63,9 +55,10 @@ _BAND_M = (
 )
 _FLAGGED_SHARE = 0.6  # a cluster with this share of moved points moved as a whole
 _PERIOD_S = 0.1  # period of scans whose times do not increase
-OWN_CELL_M, OWN_REACH_M = 0.2, 4.0
-"""Parts of the recording vehicle are found in cells of this size around the sensor, up to this
-distance.
+OWN_CELL_M, OWN_CELLS = 0.2, 40
+OWN_REACH_M = OWN_CELL_M * OWN_CELLS / 2
+"""Parts of the recording vehicle are found in so many cells of this size along each axis, around
+the sensor, up to this distance.
 """
 
 
@@ -121,7 +114,7 @@ class FreeSpaceEvidence:
         around: number of static points around each cluster, at its height. It is large for pieces
             of static objects.
         world_T_sensor: (4, 4) pose of the scan.
-        near: (K, 3) cells of the points around the sensor that are not ground: see `cells_around`.
+        near: (K,) cells of the points around the sensor that are not ground: see `cells_around`.
     """
 
     frame: int
@@ -246,10 +239,12 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
 
 
 def cells_around(points: AnyFloatArray) -> IntArray:
-    """Return the (K, 3) cells of (N, 3) points near the sensor, metres, sensor frame, each once."""
+    """Return the (K,) cells of (N, 3) points near the sensor, metres, sensor frame, each once:
+    indices of a flat array of `OWN_CELLS` along each axis.
+    """
     near = points[(np.abs(points) < OWN_REACH_M).all(axis=1)]
-    cells = np.floor(near / OWN_CELL_M).astype(np.int64)
-    return cells[first_of_cells(cells)]
+    cells = np.floor(near / OWN_CELL_M).astype(np.int64) + OWN_CELLS // 2
+    return np.unique(np.ravel_multi_index(tuple(cells.T), (OWN_CELLS,) * 3, mode="clip"))
 
 
 def _sensors(origins: Float32Array) -> list[IntArray]:

@@ -5,15 +5,20 @@ They are followed from scan to scan.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from carlasc.core.arrays import FloatArray, IntArray
+from carlasc.core.arrays import BoolArray, FloatArray, IntArray
 from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
-from carlasc.motion.evidence import OWN_CELL_M, OWN_REACH_M, FreeSpaceEvidence, cells_around
+from carlasc.motion.evidence import (
+    OWN_CELL_M,
+    OWN_CELLS,
+    OWN_REACH_M,
+    FreeSpaceEvidence,
+    cells_around,
+)
 from carlasc.motion.paths import estimate_path, is_static, middles_of, misalignment
 from carlasc.motion.planes import nearest_points
 from carlasc.motion.segments import Segment
@@ -41,15 +46,13 @@ _LEAST_CONFIDENCE = 0.5  # of an actor
 _STAYS_M, _SENSOR_PATH_M = 0.5, 1.0  # points that move with the sensor, while it drives so far
 _LINE_SLOPE = 0.004  # a quarter of a degree: the points of one scan line differ by less
 # Parts of the recording vehicle: cells around the sensor in which nearly all scans have points,
-# often at places that were free at other times; and cells beside them with such points.
+# often at places that were free at other times; and cells beside them with such points. Deskewing
+# moves such parts by decimetres whenever the speed changes, so that they do not look rigid: they
+# cannot be told from a person who walks beside the sensor at exactly its pace.
 _ALWAYS, _FREED, _OFTEN = 0.95, 0.3, 0.3
 _BESIDE_M = 1.8  # farther beside the way of the sensor, another vehicle may drive along
 _OWN_SHARE = 0.5  # an actor with so many points in these cells is none
 _SAMPLES = 300  # points of an observation that its path is estimated from
-
-
-_Cell = tuple[int, int, int]
-_ELSEWHERE: _Cell = (1 << 20, 0, 0)
 
 
 @dataclass(frozen=True)
@@ -97,10 +100,11 @@ class ActorFollower:
         self.moved: dict[int, IntArray] = {}
         self.own: list[FloatArray] = []
         self.riders: set[int] = set()
-        self._near, self._freed = Counter[_Cell](), Counter[_Cell]()
-        self._cells: dict[int, Counter[_Cell]] = {}
+        # in how many scans each cell has points, and in how many clusters
+        self._near, self._freed = np.zeros((2, OWN_CELLS**3), np.int64)
+        self._cells: dict[int, list[IntArray]] = {}
         self._poses: list[Transform] = []
-        self._close: list[tuple[int, IntArray, list[_Cell]]] = []
+        self._close: list[tuple[int, IntArray, IntArray]] = []
         self._deformable, self._label, self._number = deformable, default_label, first_instance
         self._alive: list[_ActorChain] = []
 
@@ -110,12 +114,12 @@ class ActorFollower:
         """
         self.moved[scan.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
         self._poses.append(scan.world_T_sensor)
-        self._near.update(_cells(scan.near))
+        self._near[scan.near] += 1
         for members, points in zip(scan.clusters, scan.points, strict=True):
             local = transform_points(invert(scan.world_T_sensor), points)
-            cells = _cells(cells_around(local))
-            self._freed.update(cells)
-            if cells and np.abs(local).max() < OWN_REACH_M:
+            cells = cells_around(local)
+            self._freed[cells] += 1
+            if len(cells) and np.abs(local).max() < OWN_REACH_M:
                 self._close.append((scan.frame, members, cells))
         before, self._alive = self._alive, []
         ended = list[_ActorChain]()
@@ -130,41 +134,35 @@ class ActorFollower:
         """Return the actors that have not ended, and find the parts of the recording vehicle."""
         actors = self._actors(self._alive)
         own = self._own_cells()
-        for number, cells in self._cells.items():
-            inside = sum(count for cell, count in cells.items() if cell in own)
-            if inside > _OWN_SHARE * cells.total():
+        for number, seen in self._cells.items():
+            elsewhere = sum(not len(cells) for cells in seen)
+            inside = own.ravel()[np.concatenate(seen)]
+            if inside.sum() > _OWN_SHARE * (len(inside) + elsewhere):
                 self.riders.add(number)
-        lower = np.array(sorted(own), np.float64).reshape(-1, 3) * OWN_CELL_M
+        lower = (np.argwhere(own) - OWN_CELLS // 2) * OWN_CELL_M
         self.own = list(np.hstack([lower - OWN_CELL_M, lower + 2 * OWN_CELL_M]))
-        wide = {beside for cell in own for beside in _around(cell)}
-        for frame, members, close in self._close:
-            if wide.issuperset(close):  # found by their place
+        wide = _widened(own).ravel()
+        for frame, members, cells in self._close:
+            if wide[cells].all():  # found by their place
                 self.moved[frame] = np.setdiff1d(self.moved[frame], members)
         return [actor for actor in actors if actor.segments[0].instance not in self.riders]
 
-    def _own_cells(self) -> set[_Cell]:
-        """Return the cells of the recording vehicle: what stays at one place of the sensor frame
-        over the whole drive, and is not static.
+    def _own_cells(self) -> BoolArray:
+        """Return the cells of the recording vehicle, as a cube: what stays at one place of the
+        sensor frame over the whole drive, and is not static.
         """
         poses, scans = np.array(self._poses).reshape(-1, 4, 4), len(self._poses)
+        near, freed = (count.reshape((OWN_CELLS,) * 3) for count in (self._near, self._freed))
         steps = np.diff(poses[:, :3, 3], axis=0)
         if np.abs(steps).sum(axis=0).max(initial=0.0) < _SENSOR_PATH_M:
-            return set()
+            return np.zeros(near.shape, np.bool_)
         x, y, _ = multiply(invert(poses[:-1])[:, :3, :3], steps[..., None]).sum(axis=0)[:, 0]
-        beside_m = _BESIDE_M / OWN_CELL_M * max(float(np.hypot(x, y)), 1e-6)
-        own = {
-            cell
-            for cell, count in self._near.items()
-            if count >= _ALWAYS * scans
-            and self._freed[cell] >= _FREED * scans
-            and abs(x * cell[1] - y * cell[0]) < beside_m
-        }
-        waiting = list(own)
-        while waiting:
-            for beside in _around(waiting.pop()):
-                if beside not in own and self._freed[beside] >= _OFTEN * scans:
-                    own.add(beside)
-                    waiting.append(beside)
+        places = (np.arange(OWN_CELLS) - OWN_CELLS // 2) * OWN_CELL_M
+        across_m = np.abs(x * places - y * places[:, None]) / max(float(np.hypot(x, y)), 1e-6)
+        own = (near >= _ALWAYS * scans) & (freed >= _FREED * scans)
+        own &= (across_m < _BESIDE_M)[..., None]
+        while (more := _widened(own) & ~own & (freed >= _OFTEN * scans)).any():
+            own |= more
         return own
 
     def _actors(self, chains: list[_ActorChain]) -> list[FoundActor]:
@@ -376,15 +374,12 @@ class _ActorChain:
             local if stays and driven > _SENSOR_PATH_M and len(local) >= _MIN_OBSERVATIONS else None
         )
 
-    def cells(self) -> Counter[_Cell]:
-        """Return how many observations have points in each cell around the sensor, and elsewhere
-        (one cell far away).
-        """
-        counts = Counter[_Cell]()
-        for link in self.links:
-            local = transform_points(invert(link.world_T_sensor), link.segment.points)
-            counts.update(_cells(cells_around(local)) or [_ELSEWHERE])
-        return counts
+    def cells(self) -> list[IntArray]:
+        """Return the cells around the sensor in which each observation has points."""
+        return [
+            cells_around(transform_points(invert(link.world_T_sensor), link.segment.points))
+            for link in self.links
+        ]
 
     def _is_scan_line(self) -> bool:
         """Return whether its points are of one scan line and move with the sensor, as where a scan
@@ -399,14 +394,10 @@ class _ActorChain:
         )
 
 
-def _around(cell: _Cell) -> list[_Cell]:
-    """Return a cell and those beside it."""
-    x, y, z = cell
-    return [(x + i - 1, y + j - 1, z + k - 1) for i, j, k in np.ndindex(3, 3, 3)]
-
-
-def _cells(cells: IntArray) -> list[_Cell]:
-    return [(x, y, z) for x, y, z in cells.tolist()]
+def _widened(cells: BoolArray) -> BoolArray:
+    """Return the cells of a cube, and those beside them."""
+    blocks = np.lib.stride_tricks.sliding_window_view(np.pad(cells, 1), (3, 3, 3))
+    return np.asarray(blocks.any(axis=(3, 4, 5)))
 
 
 def _is_small(size: FloatArray) -> bool:

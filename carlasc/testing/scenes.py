@@ -45,8 +45,8 @@ def _poses(values: FloatArray) -> FloatArray:
 
 def _along(way: Mapping[str, Sequence[float]], at: FloatArray) -> FloatArray:
     """Return the (..., 4, 4) poses on a way at some times."""
-    rows = [way.get(name, np.zeros(5)) for name in ("x", "y", "z", "roll", "pitch", "yaw")]
-    start, speed, amplitude, rate, phase = np.transpose(rows)
+    rows = [way.get(name, [0.0] * 5) for name in ("x", "y", "z", "roll", "pitch", "yaw")]
+    start, speed, amplitude, rate, phase = np.array(rows).T
     line = start + speed * at[..., None]
     line[..., 2] = line[..., 2].clip(0.0)  # stairs begin on the ground
     return _poses(line + amplitude * np.sin(rate * at[..., None] + phase))
@@ -97,15 +97,13 @@ def write_scans(drive: SimulatedDrive, folder: Path) -> FloatArray:
     """
     (folder / "scans").mkdir(parents=True)
     poses = np.stack([world_T_sensor(drive, frame) for frame in range(drive.frames)])
-    lines = []
-    for frame, seconds in enumerate(drive.times + _START_S):
+    times = drive.times + _START_S
+    for frame, seconds in enumerate(times):
         scan = drive.scan(frame)
         order = np.argsort(scan.seconds, kind="stable")
         table = np.column_stack([scan.points, scan.seconds])[order].astype(np.float32)
         rows = table.view([(name, "<f4") for name in ("x", "y", "z", "intensity", "t")])
         np.save(folder / "scans" / f"{seconds:.9f}.npy", rows[:, 0])
-        w, *xyz = quaternions_of(poses[frame : frame + 1, :3, :3])[0]
-        numbers = seconds, *poses[frame, :3, 3], *xyz, w
-        lines.append(" ".join(f"{number:.9f}" for number in numbers))
-    (folder / "poses.txt").write_text("\n".join(lines) + "\n", "utf-8")
+    turns = quaternions_of(poses[:, :3, :3])[:, [1, 2, 3, 0]]
+    np.savetxt(folder / "poses.txt", np.column_stack([times, poses[:, :3, 3], turns]), fmt="%.9f")
     return relative_to(poses[0], poses)
