@@ -155,6 +155,8 @@ def convert(
             flow=has_flow,
             voxels=has_voxels,
         )
+        if isinstance(grids, GridOptions) and isinstance(grids.observe, FromScans):
+            planned.max_range_m = grids.observe.max_range_m
         plans.append(planned)
     sources = SourceFiles.of(root, found, options, compare_inputs)
     records = [sources.begin(plan) for plan in plans]
