@@ -158,6 +158,9 @@ def convert(
         plan_recording(one, converter, sink, layout, poses, frames=chosen, voxels=has_voxels)
         for one in recordings
     ]
+    if isinstance(grids, GridOptions) and isinstance(grids.observe, FromScans):
+        for plan in plans:
+            plan.max_range_m = grids.observe.max_range_m
     states = None if compare == "never" else _source_states(root, found, options)
     records = []
     for plan in plans:

@@ -189,7 +189,7 @@ def _refine(
     """
     posed = sequence
     if estimated := must_estimate(sequence, options):
-        posed = with_estimated_poses(sequence, options.poses.odometry_voxel_m)
+        posed = with_estimated_poses(sequence, options)
         check_trajectory(posed, options)
     feed = ScanFeed(posed, options)
     change = refine_sequence(feed, writer, run, step)

@@ -182,7 +182,7 @@ class ScanSequence(StoredSequence):
         """
         sequence = self.sequence
         if self.estimates_poses:
-            sequence = with_estimated_poses(sequence, self.options.poses.odometry_voxel_m)
+            sequence = with_estimated_poses(sequence, self.options)
         check_trajectory(sequence, self.options)
         return sequence
 
@@ -432,8 +432,9 @@ def must_estimate(sequence: Sequence, options: FromScans) -> bool:
     return source == "kiss-icp" or (source == "auto" and layout.POSES not in sequence.documents())
 
 
-def with_estimated_poses(sequence: Sequence, voxel_m: float | None) -> Sequence:
-    """Return a sequence with poses estimated by odometry, in voxels of some size.
+def with_estimated_poses(sequence: Sequence, options: FromScans) -> Sequence:
+    """Return a sequence with poses estimated by odometry, from points within the range of the
+    options, in voxels of their size.
 
     Lines of frames without a scan repeat the pose of the last scan.
 
@@ -448,8 +449,8 @@ def with_estimated_poses(sequence: Sequence, voxel_m: float | None) -> Sequence:
         poses = estimate_poses(
             scans,
             times=times,
-            max_range_m=sequence.metadata.max_range_m or _RANGE_M,
-            voxel_m=voxel_m,
+            max_range_m=options.max_range_m or sequence.metadata.max_range_m or _RANGE_M,
+            voxel_m=options.poses.odometry_voxel_m,
         )
     except ArgumentError as error:  # an argument there, data here
         raise FormatError(
