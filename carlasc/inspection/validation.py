@@ -421,6 +421,8 @@ def _judge_poses(
     where = f"{sequence.location}/{layout.POSES}"
     quality, correction = diagnosis.quality, diagnosis.correction
     mounting = None if quality is None else quality.mounting
+    if "kiss-icp" in str(sequence.metadata.extra.get("poses")):
+        mounting = None  # poses found from the scans are those of the sensor
     described = None if mounting is None else describe_mounting(mounting)
     check, expected = OVERLAP, CHECKS[OVERLAP]
     share = f"{diagnosis.share:.1%} of a scan's structure overlaps that of an earlier scan"
