@@ -358,13 +358,12 @@ class _ExportedFrom:
         return ""
 
     def remove_gone(self) -> None:
-        """Remove the files of frames that the sequence has no longer, and other files that the
-        export has no longer.
-        """
-        left = {str(frame) for frame in self._exporter.frames(self._sequence)}
-        texts = set(self._now.frames[_TEXTS].splitlines())
-        for frame, files in self._before.frames.items():
-            for file in () if frame in left else set(files.splitlines()) - texts:
+        """Remove the files that the export has no longer."""
+        kept = set(self._now.frames[_TEXTS].splitlines())
+        for frame in self._exporter.frames(self._sequence):
+            kept.update(self._files(frame).splitlines())
+        for files in self._before.frames.values():
+            for file in set(files.splitlines()) - kept:
                 (self._folder / file).unlink(missing_ok=True)
 
     def write(self) -> None:
