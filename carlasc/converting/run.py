@@ -154,10 +154,12 @@ def convert(
     if isinstance(grids, GridOptions):
         _check_rays(recordings)
     has_voxels, chosen = isinstance(grids, str), FrameRange.of(frames)
-    plans = [
-        plan_recording(one, converter, sink, layout, poses, frames=chosen, voxels=has_voxels)
-        for one in recordings
-    ]
+    plans = []
+    for one in recordings:  # in Python 3.11, a comprehension is a level of calls
+        planned = plan_recording(
+            one, converter, sink, layout, poses, frames=chosen, voxels=has_voxels
+        )
+        plans.append(planned)
     if isinstance(grids, GridOptions) and isinstance(grids.observe, FromScans):
         for plan in plans:
             plan.max_range_m = grids.observe.max_range_m
