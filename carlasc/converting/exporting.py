@@ -358,13 +358,18 @@ class _ExportedFrom:
         return ""
 
     def remove_gone(self) -> None:
-        """Remove the files that the export has no longer."""
+        """Remove the files that the export has no longer, in its own folder: a record of a stranger
+        may name any file.
+        """
+        inside = self._folder.resolve()
         kept = set(self._now.frames[_TEXTS].splitlines())
         for frame in self._exporter.frames(self._sequence):
             kept.update(self._files(frame).splitlines())
         for files in self._before.frames.values():
             for file in set(files.splitlines()) - kept:
-                (self._folder / file).unlink(missing_ok=True)
+                path = inside / file
+                if path.is_file() and path.parent.resolve().is_relative_to(inside):
+                    path.unlink()
 
     def write(self) -> None:
         """Write the record."""
