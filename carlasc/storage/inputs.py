@@ -248,9 +248,10 @@ class MadeFrom:
         """Return the record of an output; an empty one without any, or with one that cannot be
         read.
         """
-        with suppress(KeyError, ValueError, TypeError):
+        with suppress(KeyError, ValueError, TypeError, AttributeError):
             values = _read_record(writer, layout.record_file(output))
-            return cls(str(values["whole"]), dict(values["own"]), dict(values["frames"]))
+            frames = {str(int(frame)): str(made) for frame, made in values["frames"].items()}
+            return cls(str(values["whole"]), dict(values["own"]), frames)
         return cls()
 
     def write(self, writer: SequenceWriter, output: str) -> None:
@@ -306,7 +307,7 @@ def describe_changes(old: Mapping[str, str], new: Mapping[str, str]) -> str:
     kinds = {
         "changed": [int(frame) for frame in new.keys() & old.keys() if new[frame] != old[frame]],
         "added": list(map(int, new.keys() - old.keys())),
-        "removed": list(map(int, old.keys() - new.keys())),
+        "removed": [int(frame) for frame in old.keys() - new.keys() if frame.isdecimal()],
     }
     return ", ".join(
         f"scan{'s' * (len(frames) > 1)} {first_runs(sorted(frames), _NAMED)} {kind}"

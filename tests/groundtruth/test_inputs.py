@@ -1,5 +1,6 @@
 """A run after a change of its inputs gives what a run into an empty folder gives."""
 
+import json
 import os
 import shutil
 from pathlib import Path
@@ -332,3 +333,16 @@ def test_validate_makes_a_sample_of_frames_again(made):
     for path in (scans(made) / "evaluation_32x32x8").glob("*.label"):
         path.write_bytes(bytes(path.stat().st_size))
     assert found().startswith("warning: 2 of 2 frames")
+
+
+@pytest.mark.parametrize("name", ["frames", "own", "whole"])
+def test_a_damaged_record_does_not_stop_a_run(drive, tmp_path, name):
+    regrid(drive, SPEC, tmp_path / "out", observe=STILL, run=ALONE, frames="0:2")
+    before = outputs(tmp_path / "out")
+    (record,) = (tmp_path / "out").rglob(".carlasc/made-*.json")
+    told = json.loads(record.read_text())
+    told |= {"whole": "other", name: "odd" if name == "whole" else {"odd": 1}}
+    record.write_text(json.dumps(told))
+    again = regrid(drive, SPEC, tmp_path / "out", observe=STILL, run=ALONE, frames="0:2")
+    assert not again.failures
+    assert outputs(tmp_path / "out") == before
