@@ -18,12 +18,12 @@ class Completion(lightning.LightningModule):
         self.network = torch.nn.Conv3d(2, 3, 3, padding=1)
         self.augment = Augment(directions="xy", rotate_rad=3.14, scale=0.05, seed=0)
 
-    def train_dataloader(self) -> DataLoader:
+    def train_dataloader(self) -> DataLoader[dict[str, object]]:
         """Return the batches of an epoch."""
         self.augment.set_epoch(self.current_epoch)
         return DataLoader(mixture(self.augment), batch_size=2, shuffle=True, num_workers=2)
 
-    def training_step(self, batch: dict, _: int) -> torch.Tensor:
+    def training_step(self, batch: dict[str, torch.Tensor], _: int) -> torch.Tensor:
         """Return the loss of a batch, in which unknown voxels do not count."""
         labels = batch["labels"].long().masked_fill(~batch["known"], -100)
         loss = cross_entropy(self.network(batch["occupancy"].float()), labels)
@@ -36,6 +36,12 @@ class Completion(lightning.LightningModule):
 
 
 if __name__ == "__main__":
-    options = {"devices": 2, "strategy": "ddp", "reload_dataloaders_every_n_epochs": 1}
-    trainer = lightning.Trainer(accelerator="cpu", max_epochs=5, logger=CSVLogger("."), **options)
+    trainer = lightning.Trainer(
+        accelerator="cpu",
+        devices=2,
+        strategy="ddp",
+        max_epochs=5,
+        reload_dataloaders_every_n_epochs=1,
+        logger=CSVLogger("."),
+    )
     trainer.fit(Completion())

@@ -13,7 +13,7 @@ if __name__ == "__main__":
     torch.manual_seed(0)
     augment = Augment(directions="xy", rotate_rad=3.14, scale=0.05, translate_m=0.5, seed=0)
     data = mixture(augment)
-    sampler = DistributedSampler(data)
+    sampler: DistributedSampler[dict[str, object]] = DistributedSampler(data)
     loader = DataLoader(data, batch_size=2, sampler=sampler, num_workers=2)
     network = DistributedDataParallel(torch.nn.Conv3d(2, 3, 3, padding=1))
     optimizer = torch.optim.Adam(network.parameters(), lr=0.02)
@@ -24,7 +24,7 @@ if __name__ == "__main__":
             labels = batch["labels"].long().masked_fill(~batch["known"], -100)
             loss = cross_entropy(network(batch["occupancy"].float()), labels)
             optimizer.zero_grad()
-            loss.backward()
+            loss.backward()  # type: ignore[no-untyped-call]
             optimizer.step()
         if torch.distributed.get_rank() == 0:
             print(f"epoch {epoch}: loss {loss.item():.4f}")
