@@ -48,6 +48,7 @@ from carlasc.inspection.soundness import (
 )
 from carlasc.inspection.staleness import check_inputs, check_sample
 from carlasc.motion.ground import ground_of
+from carlasc.motion.odometry import DRIFT_M
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
@@ -369,8 +370,9 @@ def _diagnose_poses(sequence: Sequence) -> tuple[PoseDiagnosis, LongOverlap] | t
         seconds = None
     if seconds is not None and not (np.diff(seconds) > 0).all():
         seconds = None  # which is reported elsewhere
-    found = diagnose_poses(structure, poses, points=reading(feed.static_points), seconds=seconds)
-    return found, measure_overlap(structure, poses)
+    points = reading(feed.static_points)
+    found = diagnose_poses(structure, poses, points=points, seconds=seconds)
+    return found, measure_overlap(structure, points, poses)
 
 
 def _judge_grid(
@@ -448,6 +450,12 @@ def _judge_poses(
         advice = "check that the poses belong to this sequence and to these frames"
     elif described is not None:
         found, advice = described
+    elif overlap.drift[0] > DRIFT_M:
+        found = f"scans that fit {overlap.drift[0]:.2f} m from their poses within ten scans"
+        advice = (
+            "write refined poses with `carlasc refine`, or estimate them with `carlasc convert "
+            "--poses kiss-icp`"
+        )
     elif quality is not None and quality.is_poor:
         check, expected = "pose-jitter", "scans that agree with their neighbours"
         found = (
