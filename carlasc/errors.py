@@ -390,13 +390,14 @@ def plugin_names(group: str) -> tuple[str, ...]:
     return tuple(sorted({entry.name for entry in entry_points(group=group)}))
 
 
-def load_plugin(group: str, name: str, base: type | None = None) -> Any:
+def load_plugin(group: str, name: str, base: type | None = None, argument: str = "name") -> Any:
     """Load what an entry point names.
 
     Args:
         group: an entry-point group, such as "carlasc.converters".
         name: name of the entry point.
         base: the class that it must inherit; None if it may be anything.
+        argument: of the caller, that has the name.
 
     Raises:
         ArgumentError: the group has no such name.
@@ -407,7 +408,7 @@ def load_plugin(group: str, name: str, base: type | None = None) -> Any:
     entries = {entry.name: entry for entry in entry_points(group=group)}
     if name not in entries:
         expected = f"one of {', '.join(sorted(entries)) or 'no names: none is installed'}"
-        raise ArgumentError("name", expected=expected, found=repr(name))
+        raise ArgumentError(argument, expected=expected, found=repr(name))
     where = f"{group.removeprefix('carlasc.').removesuffix('s')} {name} ({entries[name].value})"
     try:
         plugin = entries[name].load()

@@ -213,15 +213,6 @@ class WorkFlags(Flags):
 
 
 @dataclass(frozen=True)
-class OneWorkerFlags(WorkFlags):
-    """How work is spread; by default, one process does it."""
-
-    workers: Annotated[
-        int | None, typer.Option(help="Number of parallel processes. Default: one.", min=1)
-    ] = None
-
-
-@dataclass(frozen=True)
 class RunFlags(WorkFlags):
     """How work is spread, also over several commands."""
 
@@ -238,3 +229,17 @@ class RunFlags(WorkFlags):
         from carlasc.running.spreading import Part
 
         return {} if self.part is None else {"part": Part.parse(self.part)}
+
+
+@dataclass(frozen=True)
+class OneWorkerFlags(WorkFlags):
+    """How work is spread; by default, one process does it."""
+
+    workers: Annotated[
+        int | None, typer.Option(help="Number of parallel processes. Default: one.", min=1)
+    ] = None
+
+
+@dataclass(frozen=True)
+class OneWorkerRunFlags(OneWorkerFlags, RunFlags):
+    """As `OneWorkerFlags`, also over several commands."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Collection, Generator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
@@ -276,13 +276,11 @@ def _is_whole(exporter: Exporter, exported: Exported, folder: Path) -> bool:
 
 def _exists(exporter: Exporter, sequence: storage.Sequence, frame: int, folder: Path) -> bool:
     """Whether all files of a frame exist, or the file of its sequence."""
-    files = (
-        exporter.frame_files(sequence, frame)
-        if isinstance(exporter, FrameExporter)
-        else (exporter.file(sequence),)
-        if isinstance(exporter, SequenceExporter)
-        else ()
-    )
+    files: Iterable[str] = ()
+    if isinstance(exporter, FrameExporter):
+        files = exporter.frame_files(sequence, frame)
+    elif isinstance(exporter, SequenceExporter):
+        files = (exporter.file(sequence),)
     return all(has_content(folder / file) for file in files)
 
 

@@ -369,7 +369,7 @@ class ScanSequence(StoredSequence):
         if self.actors.own:
             notes.append(
                 f"{where}: points near the sensor move with it: they are on the recording vehicle, "
-                f"and were left out"
+                "or on a person who walks beside it at exactly its pace, and were left out"
             )
         wrong = sum(max(actor["size_m"]) >= LONGEST_M for actor in self.actors.summary)
         if wrong:
