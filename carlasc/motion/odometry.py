@@ -220,8 +220,9 @@ class _PlaneOdometry:
 
     def register_frame(self, points: FloatArray, _: FloatArray) -> None:
         """Register (N, 3) points; `last_delta` is the prediction."""
-        away = lengths(points)
-        used = points[(away >= self._limits[0]) & (away <= self._limits[1])]
+        used = points.astype(np.float32)
+        away = lengths(used)
+        used = used[(away >= self._limits[0]) & (away <= self._limits[1])]
         self._scans.append(_thinned(used, self._voxel_m))
         before, poses = self.last_pose, [*self._poses, self.last_pose @ self.last_delta]
         start = np.stack(poses)
@@ -233,10 +234,9 @@ class _PlaneOdometry:
         del self._scans[:-_HELD], self._poses[:-_HELD]
 
 
-def _thinned(points: AnyFloatArray, voxel_m: float) -> Float32Array:
+def _thinned(points: Float32Array, voxel_m: float) -> Float32Array:
     """Return one of the (N, 3) points in each voxel."""
-    used = points.astype(np.float32)
-    return used[first_of_cells(np.floor(used / np.float32(voxel_m)).astype(np.int64))]
+    return points[first_of_cells(np.floor(points / np.float32(voxel_m)).astype(np.int64))]
 
 
 def measure_drift(points: Callable[[int], AnyFloatArray], poses: FloatArray) -> tuple[float, bool]:
@@ -264,12 +264,13 @@ def measure_drift(points: Callable[[int], AnyFloatArray], poses: FloatArray) -> 
         given = poses[first : first + _START]
         start = given.copy()
         start[:, :3, 3] += risen
-        scans = [_thinned(scan, voxel_m) for scan in used]
+        scans = [_thinned(scan.astype(np.float32), voxel_m) for scan in used]
         off = (align(scans, start, start, 1, _PASSES, _PRIOR) - given)[:, :3, 3]
-        if lengths(off).max() > DRIFT_M and lengths(off - risen).max() <= DRIFT_M:
+        far, left = (float(np.linalg.norm(way, axis=1).max()) for way in (off, off - risen))
+        if far > DRIFT_M and left <= DRIFT_M:
             held = False
         else:
-            drift_m = max(drift_m, float(lengths(off).max()))
+            drift_m = max(drift_m, far)
     return drift_m, held
 
 
