@@ -267,7 +267,7 @@ def measure_drift(points: Callable[[int], AnyFloatArray], poses: FloatArray) -> 
         scans = [_thinned(scan.astype(np.float32), voxel_m) for scan in used]
         off = (align(scans, start, start, 1, _PASSES, _PRIOR) - given)[:, :3, 3]
         far, left = (float(np.linalg.norm(way, axis=1).max()) for way in (off, off - risen))
-        if far > DRIFT_M and left <= DRIFT_M:
+        if DRIFT_M < far < 2.5 * DRIFT_M and left < far:  # about where they were put
             held = False
         else:
             drift_m = max(drift_m, far)
