@@ -5,15 +5,18 @@ now, by the records of what they were made from.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from carlasc.captures.raw import RAW, Capture, CaptureFiles
 from carlasc.core.frames import FrameRange
-from carlasc.errors import CarlascError
+from carlasc.errors import ArgumentError, CarlascError, count
 from carlasc.inspection.findings import Finding, Severity
 from carlasc.running.spreading import Run
-from carlasc.storage.folder import FolderSequence
+from carlasc.storage import layout
+from carlasc.storage.folder import FolderSequence, FolderWriter
 from carlasc.storage.inputs import (
     FrameFiles,
     MadeFrom,
@@ -23,6 +26,10 @@ from carlasc.storage.inputs import (
     describe_changes,
 )
 from carlasc.storage.protocol import Sequence, SequenceWriter
+from carlasc.storage.resuming import RECORD
+
+if TYPE_CHECKING:
+    from carlasc.groundtruth.inputs import SequenceInput
 
 _SEED = 0
 _ADVICE = "make the grid again with the command that made it: it makes what changed again"
@@ -91,6 +98,63 @@ def check_sample(sequence: Sequence, count: int, run: Run) -> Iterator[Finding]:
         kind: Severity = "warning" if different else "note"
         expected, advice = "what is made of the scans now", _ADVICE if different else ""
         yield Finding(kind, "inputs", where, expected, found, advice)
+
+
+def record_inputs(sequence: Sequence, run: Run) -> Iterator[Finding]:
+    """Write the record of what grids were made from, of frames without one, as if they were made
+    of the inputs as they are now; and yield a note for each grid.
+
+    Raises:
+        ArgumentError: such a grid is not in a folder.
+    """
+    from carlasc.groundtruth.inputs import InputCheck  # compiled code, which `info` does not need
+
+    for grid in sequence.grids:
+        frames = {*sequence.frames(f"{grid}/labels").tolist()}
+        writer = _Records(sequence)
+        unknown = frames - {*map(int, MadeFrom.read(writer, f"made-{grid}").frames)}
+        inputs = _inputs_of(sequence, grid) if unknown else None
+        if inputs is None:
+            continue
+        if not isinstance(sequence, FolderSequence):
+            found = sequence.location
+            raise ArgumentError("record", expected="a folder, which keeps records", found=found)
+        check = InputCheck(inputs, FolderWriter(sequence.folder), grid, "fast")
+        check.look(frames, lambda frame: True, run)
+        if check.stale:  # they are made again
+            continue
+        check.begin(frames, ())
+        check.finish(())
+        found = f"none of {count(len(unknown), 'frame')}: they count as made of the inputs of now"
+        where, expected = f"{sequence.location}/{grid}", "a record of what frames were made from"
+        yield Finding("note", "inputs", where, expected, found)
+
+
+def _inputs_of(sequence: Sequence, grid: str) -> SequenceInput | None:
+    """Return the inputs of a grid, if they are beside it."""
+    from carlasc.groundtruth.from_capture import CaptureSequence
+    from carlasc.groundtruth.from_grid import ResampledSequence
+    from carlasc.groundtruth.inputs import GridPlan
+    from carlasc.groundtruth.options import FromCapture, FromGrid, Voting
+    from carlasc.inspection.reports import inputs_of
+
+    made = sequence.params(grid).get(RECORD)
+    if not isinstance(made, dict) or _files(sequence, made)[0] is None:
+        return None
+    keep = {
+        f"keep_{name}": f"{grid}/{part}" in sequence.fields()
+        for name, part in (("actors", layout.ACTOR_FIELDS[0]), ("seen", "seen"))
+    }
+    if made["observe"] == "scans":
+        if (scans := inputs_of(sequence, grid)) is not None:
+            scans.plan = replace(scans.plan, voting=replace(scans.plan.voting, **keep))
+        return scans
+    observe = FromGrid(made["grid"]) if made["observe"] == "grid" else FromCapture()
+    frames = FrameRange.of(made.get("frames"))
+    plan = GridPlan(sequence.grids[grid], grid, observe, Voting(**keep), frames)
+    if made["observe"] == "grid":
+        return ResampledSequence(sequence, made["grid"], plan)
+    return CaptureSequence(Capture(sequence.folder.parent), "", plan)
 
 
 def changed_inputs(sequence: Sequence, grid: str) -> str:

@@ -32,11 +32,6 @@ from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 from carlasc.storage.transport.trees import Tree
 
-UNKNOWN = (
-    "there is no record of what existing frames were made from: they are kept; "
-    '`compare_inputs="content"` compares them'
-)
-"""The note on outputs of an older version, or whose record was deleted."""
 _FORMAT = 1
 _BYTES = 16  # of the digest of a file
 _SHORT = 8  # bytes of the digests in records

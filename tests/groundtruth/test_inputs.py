@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.datasets.captures import write_capture
+from helpers.errors import raises
 from helpers.scenes.passing_car import write_sequence
 
 import carlasc
-from carlasc import FromGrid, FromScans, GridSpec, Run, regrid
+from carlasc import FromGrid, FromScans, GridSpec, Run, Voting, regrid
+from carlasc.errors import ArgumentError
 from carlasc.motion import PoseOptions
 from carlasc.running import Part
 
@@ -196,6 +198,38 @@ def test_grids_without_a_record_are_compared_once(made):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("kind", ["scans", "actors", "capture", "grid"])
+def test_validate_records_the_inputs_of_grids_without_a_record(made, tmp_path, kind):
+    source, options = made, {"observe": STILL}
+    if kind == "capture":
+        source, options = tmp_path / "town", {}
+        write_capture(source, frames=4)
+    elif kind == "grid":
+        options = {"observe": FromGrid()}
+    elif kind == "actors":
+        aligned = FromScans(window=(-2, 2), poses=PoseOptions("file", "never"))
+        options = {"observe": aligned, "voting": Voting(keep_actors=True), "name": "with_actors"}
+    spec = SPEC.with_size((16, 16, 4)) if kind == "grid" else SPEC
+    regrid(source, spec, run=ALONE, **options)
+    expected = {path: path.read_bytes() for path in source.rglob(".carlasc/made-*.json")}
+    for path in expected:
+        path.unlink()
+    found = [one.found for one in carlasc.validate(source, record=True).findings]
+    assert sum("count as made" in text for text in found) == len(expected)
+    assert {path: path.read_bytes() for path in source.rglob(".carlasc/made-*.json")} == expected
+    again = regrid(source, spec, run=ALONE, **options)
+    assert again.made == 0 and not any("record" in note for note in again.notes)
+    found = [one.found for one in carlasc.validate(source, record=True).findings]
+    assert not any("count as made" in text for text in found)
+
+
+def test_only_folders_keep_records(made, tmp_path):
+    carlasc.pack(made, tmp_path / "data.zarr", run=ALONE)
+    with raises(ArgumentError, where="record", expected="a folder"):
+        carlasc.validate(tmp_path / "data.zarr", record=True)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [change_points, change_labels, move_pose, remove])
 def test_info_and_validate_name_grids_that_are_stale(made, change):
     change(made, np.random.default_rng(0))
@@ -261,11 +295,12 @@ def test_grids_in_a_folder_of_scans_in_a_store(drive, tmp_path, ending, workers)
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("change", [change_points, remove, grow])
 @pytest.mark.parametrize("workers", [1, 2])
-def test_grids_in_a_zarr_store(drive, tmp_path, workers):
+def test_grids_in_a_zarr_store(drive, tmp_path, workers, change):
     source, run = copy(drive, tmp_path / "data"), Run(workers)
     regrid(source, SPEC, tmp_path / "out.zarr", observe=STILL, run=run)
-    change_points(source, np.random.default_rng(0))
+    change(source, np.random.default_rng(0))
     again = regrid(source, SPEC, tmp_path / "out.zarr", observe=STILL, run=run)
     assert 0 < again.made < FRAMES
     carlasc.unpack(tmp_path / "out.zarr", tmp_path / "out", run=ALONE)

@@ -4,14 +4,18 @@ folder gives, or is refused.
 
 from __future__ import annotations
 
+import re
 import shutil
 import time
 import zlib
+from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
+import carlasc
 from faults.commands import COMMANDS, MESSAGES, Command, run_command, warm
 from faults.comparing import STORES, Content, arrays_of, content_of, differences
 from faults.outcome import Outcome
@@ -19,6 +23,8 @@ from faults.trying import shares, try_commands
 
 _RECORDS = ".carlasc"
 _TEXTS = (".txt", ".json")
+_FRAME = re.compile(r"(\d+)\.[a-z.]+")
+_REPAIRED = 0.3  # share of the changes that are taken back
 _STEPS = 16  # bytes: a point, and a multiple of the size of a label
 REPEATED = tuple(
     name
@@ -48,7 +54,6 @@ def _try_command(
     command: Command, count: int | None, seed: int, base: Path, work: Path
 ) -> tuple[int, list[str]]:
     warm(command, base, work / "warm")
-    first, fresh, found = work / "case", work / "fresh", []
     shutil.rmtree(work / "done", ignore_errors=True)
     command.copy_inputs(base, work / "done")
     if code := run_command(command, work / "done"):
@@ -59,35 +64,97 @@ def _try_command(
         for path in sorted([base / name, *(base / name).rglob("*")])
         if path.is_file() and _RECORDS not in path.parts
     ]
-    for number in range(count or 1):
+    tried, number, found, refused = 0, 0, [], Counter[str]()
+    while tried < (count or 1):
         rng = np.random.default_rng([seed, zlib.crc32(command.name.encode()), number])
-        path = inputs[rng.integers(len(inputs))]
-        change = CHANGES[rng.integers(len(CHANGES))]
-        shutil.rmtree(fresh, ignore_errors=True)
-        shutil.rmtree(first, ignore_errors=True)
-        command.copy_inputs(base, fresh)
-        shutil.copytree(work / "done", first)
-        draw = int(rng.integers(2**32))
-        changed = [change(case / path, np.random.default_rng(draw)) for case in (first, fresh)]
-        if not all(changed):
-            continue
-        codes = [run_command(command, case) for case in (first, fresh)]
-        if codes[0]:  # refused, or the input is damaged
-            continue
+        path, change = inputs[rng.integers(len(inputs))], CHANGES[rng.integers(len(CHANGES))]
+        is_repaired, draw = bool(rng.random() < _REPAIRED), int(rng.integers(2**32))
         story = f"{command.name}, seed {seed}, case {number}: {change.__name__} {path}"
-        if codes[1]:
-            found.append(f"{story}: exit code 0, and {codes[1]} into an empty folder")
+        number += 1
+        shutil.rmtree(work / "case", ignore_errors=True)
+        shutil.copytree(work / "done", work / "case")
+        before = content_of(work / "case")
+        if not change(work / "case" / path, np.random.default_rng(draw)):
             continue
-        found += [f"{story}: {line}" for line in _wrong(command, fresh, first)]
-    return count or 1, found
+        after = content_of(work / "case")
+        tried += 1
+        code = run_command(command, work / "case")
+        if is_repaired:
+            found += [
+                f"{story}, repaired: {line}" for line in _repaired(command, work, before, after)
+            ]
+            continue
+        shutil.rmtree(work / "fresh", ignore_errors=True)
+        command.copy_inputs(base, work / "fresh")
+        change(work / "fresh" / path, np.random.default_rng(draw))
+        fresh = run_command(command, work / "fresh")
+        if code and not fresh:
+            refused[f"{change.__name__} {Path(path).suffix}: {_last_line(work / 'case')}"] += 1
+            if not _may_refuse(command, path):
+                found.append(f"{story}: refused: {_last_line(work / 'case')}")
+        elif fresh and not code:
+            found.append(f"{story}: exit code 0, and {fresh} into an empty folder")
+        elif not code or command.name == "audit-keep":
+            found += [f"{story}: {line}" for line in _wrong(command, work / "fresh", work / "case")]
+    for line, times in refused.items():
+        print(f"{command.name}: refused {times} times: {line}", flush=True)
+    return tried, found
+
+
+def _repaired(command: Command, work: Path, before: Content, after: Content) -> list[str]:
+    """Take a change back and run a command once more; returns what differs from the first run."""
+    case = work / "case"
+    for name in before.keys() | after.keys():
+        if (data := before.get(name)) is not None and data != after.get(name):
+            (case / name).write_bytes(data)
+        elif name not in before:
+            (case / name).unlink()
+    if code := run_command(command, case):
+        return [] if _may_refuse(command) else [f"exit code {code}: {_last_line(case)}"]
+    return _wrong(command, work / "done", case)
+
+
+def _may_refuse(command: Command, path: str = "") -> bool:
+    """Whether a command may refuse to continue: stores and copies that are finished, and poses and
+    times of `convert`.
+    """
+    if command.name.startswith(("label", "refine", "map")):
+        return True
+    is_convert = command.name.startswith("convert")
+    return Path(command.output).suffix in (".h5", ".parquet") or (
+        is_convert and Path(path).name in ("poses.txt", "times.txt")
+    )
+
+
+def _last_line(case: Path) -> str:
+    return (case / MESSAGES).read_text().strip().rpartition("\n")[2]
 
 
 def _wrong(command: Command, fresh: Path, first: Path) -> list[str]:
     """Describe how the outputs differ, without records of inputs."""
     if Path(command.output).suffix in STORES:
-        expected, found = (arrays_of(case / command.output) for case in (fresh, first))
-        return [f"{name} differs" for name in expected if found.get(name) != expected[name]]
-    return differences(*(_without_records(content_of(case)) for case in (fresh, first)))
+        expected, found = (_content_of_store(case / command.output) for case in (fresh, first))
+    else:
+        expected, found = (_without_records(content_of(case)) for case in (fresh, first))
+    wrong = differences(expected, found)
+    if command.name == "audit-keep":
+        verdicts = [_verdicts(case) for case in (fresh, first)]
+        wrong += [] if verdicts[0] == verdicts[1] else ["other verdicts"]
+    return wrong
+
+
+def _verdicts(case: Path) -> list[str]:
+    lines = (case / MESSAGES).read_text().splitlines()
+    return [line for line in lines if not line.startswith(("note:", "Auditing"))]
+
+
+def _content_of_store(store: Path) -> Content:
+    """Return the digests of the arrays of a store, and its text files."""
+    content: Content = {name: digest.encode() for name, digest in arrays_of(store).items()}
+    for path, sequence in carlasc.open(store).sequences().items():
+        for name in sequence.documents():
+            content[f"{path}/{name}"] = sequence.read_document(name)
+    return _without_records(content)
 
 
 def _without_records(content: Content) -> Content:
@@ -138,6 +205,49 @@ def _touch(path: Path, rng: np.random.Generator) -> bool:
     return True
 
 
+def _grow(path: Path, rng: np.random.Generator) -> bool:
+    """Add a frame: a copy of the last file of each folder, and of the last line of text files."""
+    if not _FRAME.fullmatch(path.name):
+        return False
+    for folder in path.parent.parent.iterdir():
+        if folder.is_dir() and (frames := _frames(folder)):
+            last = frames[max(frames)]
+            number = str(max(frames) + 1).zfill(len(last.name.partition(".")[0]))
+            shutil.copy(last, folder / f"{number}{''.join(last.suffixes)}")
+        elif folder.name.startswith(("poses", "times")) and folder.suffix == ".txt":
+            lines = folder.read_text().splitlines()
+            lines.append(lines[-1])
+            if folder.name.startswith("times"):
+                lines[-1] = _next_time(lines[-1])
+            folder.write_text("\n".join(lines) + "\n")
+    return True
+
+
+def _next_time(line: str) -> str:
+    with suppress(ValueError):
+        return str(float(line) + 0.1)
+    number = int(line.partition(",")[0]) + 1  # of a capture
+    elapsed = f"frame={number},elapsed_seconds={number / 10}"
+    return (
+        f"{number}, {re.sub(r'frame=.*?,elapsed_seconds=[^,]*', elapsed, line.partition(', ')[2])}"
+    )
+
+
+def _drop(path: Path, rng: np.random.Generator) -> bool:
+    """Remove all files of a frame."""
+    if not (match := _FRAME.fullmatch(path.name)):
+        return False
+    for folder in path.parent.parent.iterdir():
+        if folder.is_dir() and (file := _frames(folder).get(int(match[1]))):
+            file.unlink()
+    return True
+
+
+def _frames(folder: Path) -> dict[int, Path]:
+    found = {path: _FRAME.fullmatch(path.name) for path in folder.iterdir()}
+    return {int(match[1]): path for path, match in found.items() if match}
+
+
 CHANGES: tuple[Callable[[Path, np.random.Generator], bool], ...] = (
     _values,
     _values,
@@ -145,4 +255,6 @@ CHANGES: tuple[Callable[[Path, np.random.Generator], bool], ...] = (
     _remove,
     _text,
     _touch,
+    _grow,
+    _drop,
 )

@@ -35,8 +35,7 @@ ENDINGS, ENDING_SHARES = (
     (1, 2, 3),
     (0.6, 0.3, 0.1),
 )
-# a command that starts processes of its own takes so many times as long, and is ended so many times
-# less often
+# a slow command, or one that starts processes of its own, is ended so many times less often
 SLOW = 10
 GRACE_S = 15.0  # within which the workers of a killed process end
 GROWING = (
@@ -69,7 +68,9 @@ def run(count: int, seed: int, folder: Path, names: Sequence[str] | None = None)
 
 def _shares(names: list[str], count: int, seed: int) -> dict[str, int | None]:
     """Return how many moments each command gets."""
-    weights = np.array([1 / SLOW if (COMMANDS[name].workers or 1) > 1 else 1.0 for name in names])
+    commands = [COMMANDS[name] for name in names]
+    slow = [command.slow or (command.workers or 1) > 1 for command in commands]
+    weights = np.where(slow, 1 / SLOW, 1.0)
     chosen = np.random.default_rng(seed).choice(len(names), count, p=weights / weights.sum())
     numbers = np.bincount(chosen, minlength=len(names)).tolist()
     return {name: number for name, number in zip(names, numbers, strict=True) if number}
