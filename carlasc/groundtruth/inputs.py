@@ -40,6 +40,7 @@ from carlasc.storage.inputs import (
 )
 from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import Sequence, SequenceWriter
+from carlasc.storage.resuming import agree_lines
 
 if TYPE_CHECKING:
     from carlasc.groundtruth.seen import Views
@@ -469,6 +470,10 @@ class InputCheck:
             is_copy = os.path.realpath(writer.location) != os.path.realpath(self.inputs.location)
             written = [f"{self.grid}/{part}" for part in layout.GRID_FIELDS]
             writer.remove_frames([*(layout.SCAN_FIELDS if is_copy else ()), *written], self.gone)
+            of_frames = {layout.POSES: self.inputs.poses(), layout.TIMES: self.inputs.times()}
+            for name, lines in of_frames.items():
+                if left := agree_lines(writer, name, lines, is_whole=True):
+                    writer.write_document(name, left)
         for frame in self.gone:
             del record.frames[str(frame)]
         record.frames |= {
