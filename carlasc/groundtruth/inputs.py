@@ -414,10 +414,7 @@ class InputCheck:
             return
         contents = content_digests(files, inputs.depended(), self.writer, self.compare, run)
         inputs.take_contents(contents)
-        self._own = {
-            str(frame): combined(content, inputs.about(frame))
-            for frame, content in sorted(contents.items())
-        }
+        self._own = self._own_of(contents)
         self._whole = combined(sorted(self._own.items()), inputs.shared())
         self.changed = self.must_record = bool(record.frames) and self._whole != record.whole
         recorded = {frame: record.frames.get(str(frame)) for frame in existing}
@@ -437,6 +434,22 @@ class InputCheck:
         if unknown := [frame for frame in sorted(existing) if recorded[frame] is None]:
             self._accept(unknown, agrees)
             self.must_record = True
+
+    def _own_of(self, contents: Mapping[int, str]) -> dict[str, str]:
+        return {
+            str(frame): combined(content, self.inputs.about(frame))
+            for frame, content in sorted(contents.items())
+        }
+
+    def is_of_input(self) -> bool:
+        """Whether the grid was made from this input, of which some frames changed since: most
+        others are as they were.
+        """
+        before, files = MadeFrom.read(self.writer, self._name).own, self.inputs.files()
+        if files is None or self.compare == "never":
+            return False
+        now = self._own_of(content_digests(files, self.inputs.depended()))
+        return 2 * len(now.items() & before.items()) >= max(len(now), 1)
 
     def _made_from(self, frame: int) -> str:
         if frame not in self._made:

@@ -285,15 +285,19 @@ def _prepare(
     params = parse_json(to_json(settings), plan.grid)  # as a later run reads it
     numbers = [frame.number for frame in inputs.frames]
     exists = check_grid(writer, plan.grid, params, numbers, overwrite=overwrite)
+    check = InputCheck(inputs, writer, plan.grid, compare)
     documents = {
         layout.METADATA: agree_metadata(writer, inputs.metadata),
-        layout.POSES: agree_lines(writer, layout.POSES, inputs.poses()),
-        layout.TIMES: agree_lines(writer, layout.TIMES, inputs.times()),
+        layout.POSES: agree_lines(
+            writer, layout.POSES, inputs.poses(), may_change=check.is_of_input
+        ),
+        layout.TIMES: agree_lines(
+            writer, layout.TIMES, inputs.times(), may_change=check.is_of_input
+        ),
         layout.CAMERAS: None if cameras == writer.read_document(layout.CAMERAS) else cameras,
         layout.params_file(plan.grid): to_json(params),
     }
     needed = {name: data for name, data in documents.items() if data is not None}
-    check = InputCheck(inputs, writer, plan.grid, compare)
     replaces = exists and overwrite
     return SequenceJob(path, inputs, plan, writer, needed, params, replaces, check)
 

@@ -278,6 +278,46 @@ def test_a_changed_recording_of_a_capture(tmp_path, sensor):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("source", "change"),
+    [
+        ("file", move_pose),
+        ("file", delay),
+        *(
+            pytest.param("kiss-icp", change, marks=pytest.mark.needs("kiss_icp"))
+            for change in (change_points, shorten, delay)
+        ),
+    ],
+)
+def test_poses_elsewhere_follow(drive, tmp_path, change, source):
+    given, out = copy(drive, tmp_path / "data"), tmp_path / "out"
+    observe = FromScans(window=(-2, 2), dynamic="tube", poses=PoseOptions(source, "never"))
+    if source == "kiss-icp":
+        (scans(given) / "poses.txt").unlink()
+    regrid(given, SPEC, out, observe=observe, run=ALONE)
+    change(given, np.random.default_rng(0))
+    again = regrid(given, SPEC, out, observe=observe, run=ALONE)
+    assert again.made and not again.failures
+    assert regrid(given, SPEC, out, observe=observe, run=ALONE).made == 0
+    regrid(given, SPEC, tmp_path / "fresh", observe=observe, run=ALONE)
+    assert outputs(out) == outputs(tmp_path / "fresh")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("frame", [100, 102])
+def test_a_changed_pose_of_a_capture(tmp_path, frame):
+    write_capture(tmp_path / "data", frames=4)
+    regrid(tmp_path / "data", SPEC, tmp_path / "out", run=ALONE)
+    path = tmp_path / f"data/raw/pose0/{frame}.npy"
+    pose = np.load(path)
+    pose[0, 3] += 0.1
+    np.save(path, pose)
+    assert regrid(tmp_path / "data", SPEC, tmp_path / "out", run=ALONE).made
+    regrid(tmp_path / "data", SPEC, tmp_path / "fresh", run=ALONE)
+    assert outputs(tmp_path / "out") == outputs(tmp_path / "fresh")
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 @pytest.mark.parametrize("ending", ["zarr", "h5", "parquet"])
 def test_grids_in_a_folder_of_scans_in_a_store(drive, tmp_path, ending, workers):

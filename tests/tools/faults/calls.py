@@ -68,7 +68,7 @@ def run(count: int, seed: int, folder: Path, names: Sequence[str] | None = None)
     """
     began = time.monotonic()
     tried, found = run_with_library("faults.calls", count, seed, folder, names or ALONE)
-    return Outcome("calls", tried, found, time.monotonic() - began)
+    return Outcome.of("calls", began, tried, found)
 
 
 def _try_command(

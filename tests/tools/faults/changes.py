@@ -24,6 +24,7 @@ from faults.trying import shares, try_commands
 _RECORDS = ".carlasc"
 _TEXTS = (".txt", ".json")
 _FRAME = re.compile(r"(\d+)\.[a-z.]+")
+_OTHER_SETTINGS = "expected a grid with the same settings"  # such as another first frame
 _REPAIRED = 0.3  # share of the changes that are taken back
 _STEPS = 16  # bytes: a point, and a multiple of the size of a label
 REPEATED = tuple(
@@ -47,7 +48,7 @@ def run(count: int, seed: int, folder: Path, names: Sequence[str] | None = None)
     """
     began = time.monotonic()
     tried, found = try_commands(_try_command, shares(names or REPEATED, count), seed, folder)
-    return Outcome("changes", tried, found, time.monotonic() - began)
+    return Outcome.of("changes", began, tried, found)
 
 
 def _try_command(
@@ -89,15 +90,15 @@ def _try_command(
         change(work / "fresh" / path, np.random.default_rng(draw))
         fresh = run_command(command, work / "fresh")
         if code and not fresh:
-            refused[f"{change.__name__} {Path(path).suffix}: {_last_line(work / 'case')}"] += 1
-            if not _may_refuse(command, path):
+            refused[_last_line(work / "case")] += 1
+            if not _may_refuse(command, path) and _OTHER_SETTINGS not in _last_line(work / "case"):
                 found.append(f"{story}: refused: {_last_line(work / 'case')}")
         elif fresh and not code:
             found.append(f"{story}: exit code 0, and {fresh} into an empty folder")
         elif not code or command.name == "audit-keep":
             found += [f"{story}: {line}" for line in _wrong(command, work / "fresh", work / "case")]
-    for line, times in refused.items():
-        print(f"{command.name}: refused {times} times: {line}", flush=True)
+    lines = [f"{times} times: {line}\n" for line, times in refused.items()]
+    (base.parent / f"refused-{command.name}.txt").write_text("".join(lines))
     return tried, found
 
 

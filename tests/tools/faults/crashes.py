@@ -59,7 +59,7 @@ def run(count: int, seed: int, folder: Path, names: Sequence[str] | None = None)
     """
     began = time.monotonic()
     tried, found = run_with_library("faults.crashes", count, seed, folder, names or RECORDED)
-    return Outcome("crashes", tried, found, time.monotonic() - began)
+    return Outcome.of("crashes", began, tried, found)
 
 
 def _try_command(
