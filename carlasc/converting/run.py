@@ -259,7 +259,7 @@ class _ConvertedFrom:
         exists = len(plan.missing) < len(plan.recording.frames)
         is_other = before.own != states or _GAP in before.frames.values()
         if exists and (compare == "content" or is_other):
-            plan.make_again()
+            plan.make_again(is_same=bool(before.own.items() & states.items()))
         else:
             self._write(())
 

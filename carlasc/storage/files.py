@@ -12,6 +12,7 @@ import glob
 import json
 import os
 import re
+import shutil
 import socket
 import sys
 import threading
@@ -159,6 +160,28 @@ def write_output(path: Path, content: Content) -> None:
     write_atomic(path, content)
 
 
+@contextmanager
+def temporary_folder(beside: Path) -> Iterator[Path]:
+    """Make a folder beside an output file, and remove it at the end; those of killed runs are
+    removed first.
+
+    Raises:
+        StorageError: it cannot be written to; names the output.
+    """
+    folder = _temporary(beside)
+    try:
+        beside.parent.mkdir(parents=True, exist_ok=True)
+        _remove_ended(beside.parent.glob(f".{glob.escape(beside.name)}.*{_PART}"))
+        folder.mkdir()
+        yield folder
+    except OSError as error:
+        if error.filename and not Path(error.filename).is_relative_to(beside.parent):
+            raise
+        raise storage_error(beside, error) from error
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def check_target(out: Path, endings: tuple[str, ...], overwrite: bool) -> None:
     """Check that a file can be written: its ending, and that its path is free.
 
@@ -198,7 +221,7 @@ def _remove_ended(parts: Iterable[Path]) -> None:
             if (
                 match and not _is_alive(int(match[1]))
             ) or time.time() - part.stat().st_mtime > 86400:
-                part.unlink()
+                (shutil.rmtree if part.is_dir() else Path.unlink)(part)
         except FileNotFoundError:
             continue  # its writer finished meanwhile
 

@@ -141,5 +141,6 @@ def test_frames_without_a_record_are_compared_once(tmp_path):
     assert again.made == 0 and any("no record" in note for note in again.notes)
     for record in (tmp_path / "out").rglob(".carlasc/conversion.json"):
         record.unlink()
+    shutil.rmtree(tmp_path / "fresh")
     change_labels(folder)
     assert check(tmp_path / "in", tmp_path / "out").made > 0

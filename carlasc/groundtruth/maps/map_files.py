@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,7 @@ from carlasc.groundtruth.maps.cloud_files import (
     write_octomap,
     write_points,
 )
-from carlasc.storage.files import AnyPath, write_output, writing
+from carlasc.storage.files import AnyPath, write_output
 
 OCTOMAP = ".bt"
 ACTORS = "actors.json"
@@ -149,17 +148,6 @@ class MapFiles:
         ):
             if needed:
                 import_extra(module, extra)
-
-    def folder(self) -> tempfile.TemporaryDirectory[str]:
-        """Return a folder beside the map for cells that do not fit into memory; it is removed at
-        the end, also after Ctrl-C.
-        """
-        place = self.all[0].parent
-        with writing(place):
-            place.mkdir(parents=True, exist_ok=True)
-            return tempfile.TemporaryDirectory(
-                dir=place, prefix=f".{self.all[0].name}.", suffix=".part"
-            )
 
     def write(self, points: PointPieces, cells: Callable[[], MapCells]) -> None:
         """Write the points, or the tree, and the mesh; `cells` returns the cells of the tree and

@@ -42,7 +42,7 @@ from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
 from carlasc.storage.derived_copies import check_complete
-from carlasc.storage.files import AnyPath, to_json, write_atomic, writing
+from carlasc.storage.files import AnyPath, temporary_folder, to_json, write_atomic, writing
 from carlasc.storage.folder import FolderWriter
 from carlasc.storage.inputs import MadeFrom, combined, sequence_states
 from carlasc.storage.protocol import Sequence, Source
@@ -153,8 +153,8 @@ def map(
         points = write_grid(opened, grid, wanted, files)
     else:
         options = FromScans(window=(0, 0), motion=motion, poses=poses)
-        with files.folder() as folder:
-            drive = DriveMap.of(opened, wanted, options, GrowingCells(Path(folder), cell_m))
+        with temporary_folder(first) as folder:  # of cells that do not fit into memory
+            drive = DriveMap.of(opened, wanted, options, GrowingCells(folder, cell_m))
             drive.fill(run, actors)
             points, count, notes = drive.write(files), len(drive.frames), drive.notes()
             if files.actors is not None and files.out is not None:

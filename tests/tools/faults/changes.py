@@ -212,9 +212,9 @@ def _grow(path: Path, rng: np.random.Generator) -> bool:
         return False
     for folder in path.parent.parent.iterdir():
         if folder.is_dir() and (frames := _frames(folder)):
-            last = frames[max(frames)]
-            number = str(max(frames) + 1).zfill(len(last.name.partition(".")[0]))
-            shutil.copy(last, folder / f"{number}{''.join(last.suffixes)}")
+            for last in frames[max(frames)]:
+                number = str(max(frames) + 1).zfill(len(last.name.partition(".")[0]))
+                shutil.copy(last, folder / f"{number}{''.join(last.suffixes)}")
         elif folder.name.startswith(("poses", "times")) and folder.suffix == ".txt":
             lines = folder.read_text().splitlines()
             lines.append(lines[-1])
@@ -239,14 +239,17 @@ def _drop(path: Path, rng: np.random.Generator) -> bool:
     if not (match := _FRAME.fullmatch(path.name)):
         return False
     for folder in path.parent.parent.iterdir():
-        if folder.is_dir() and (file := _frames(folder).get(int(match[1]))):
+        for file in _frames(folder).get(int(match[1]), []) if folder.is_dir() else []:
             file.unlink()
     return True
 
 
-def _frames(folder: Path) -> dict[int, Path]:
-    found = {path: _FRAME.fullmatch(path.name) for path in folder.iterdir()}
-    return {int(match[1]): path for path, match in found.items() if match}
+def _frames(folder: Path) -> dict[int, list[Path]]:
+    frames: dict[int, list[Path]] = {}
+    for path in sorted(folder.iterdir()):
+        if match := _FRAME.fullmatch(path.name):
+            frames.setdefault(int(match[1]), []).append(path)
+    return frames
 
 
 CHANGES: tuple[Callable[[Path, np.random.Generator], bool], ...] = (

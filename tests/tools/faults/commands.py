@@ -85,7 +85,7 @@ _ZARR, _HDF5, _PARQUET = ("numcodecs", "pcodec"), ("h5py", "hdf5plugin"), ("pyar
 _SAME = "--grid evaluation_16x16x8 --truth-grid evaluation_16x16x8"
 _PICTURES = ("embreex", "PIL", "imageio_ffmpeg")
 
-_ALL = (
+EVERY = (
     Command("simulate", f"simulate out {SIMULATED}", (), "out"),
     Command("simulate-zarr", f"simulate out.zarr {SIMULATED} {GRID}", (), "out.zarr", _ZARR),
     Command("simulate-workers", f"simulate out {SIMULATED}", (), "out", workers=2),
@@ -241,7 +241,7 @@ READ_ONLY = ("info", "validate", "doctor")
 
 COMMANDS = {
     command.name: command
-    for command in _ALL
+    for command in EVERY
     if all(find_spec(package) for package in (*command.needs, "trimesh", "embreex"))
 }
 """The commands whose packages are installed, by name.
