@@ -8,18 +8,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.datasets.captures import write_capture
+from helpers.datasets.tiny_kitti import write_tiny_kitti
 from helpers.errors import raises
 from helpers.scenes.passing_car import write_sequence
 
 import carlasc
 from carlasc import FromGrid, FromScans, GridSpec, Run, Voting, regrid
+from carlasc.converting import convert, export
 from carlasc.errors import ArgumentError
 from carlasc.motion import PoseOptions
-from carlasc.running import Part
+from carlasc.running import Part, open_cluster
 
 SPEC = GridSpec("cartesian", (32, 32, 8), (-12.8, -12.8, -2.0), (12.8, 12.8, 1.2))
 FRAMES = 9
 ALONE = Run(workers=1)
+FORCED = PoseOptions(force=True)
 STILL = FromScans(window=(-2, 2), dynamic="tube", poses=PoseOptions("file", "never"))
 
 
@@ -28,7 +31,7 @@ def outputs(folder: Path) -> dict[str, bytes]:
     return {
         path.relative_to(folder).as_posix(): path.read_bytes()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and ".carlasc" not in path.parts
+        if path.is_file() and ".carlasc" not in path.parts and "-1-of-1.json" not in path.name
     }
 
 
@@ -161,6 +164,16 @@ def test_a_copy_with_other_times_is_not_stale(made, tmp_path):
     again = regrid(other, SPEC, observe=STILL, run=ALONE)
     assert (again.made, again.notes) == (0, regrid(made, SPEC, observe=STILL, run=ALONE).notes)
     assert not any(grid.stale for one in carlasc.info(other).sequences for grid in one.grids)
+
+
+@pytest.mark.slow
+def test_a_report_follows_the_text_files(made, tmp_path):
+    fresh = tmp_path / "fresh"
+    (scans(made) / "times.txt").unlink()
+    shutil.copytree(made, fresh, ignore=shutil.ignore_patterns("evaluation*", ".carlasc"))
+    regrid(made, SPEC, observe=STILL, run=ALONE)
+    regrid(fresh, SPEC, observe=STILL, run=ALONE)
+    assert outputs(made) == outputs(fresh)
 
 
 @pytest.mark.slow
@@ -359,6 +372,61 @@ def test_parts_make_what_changed_again(drive, tmp_path):
     assert 0 < sum(one.made for one in again) < FRAMES
     regrid(source, SPEC, tmp_path / "fresh", observe=STILL, run=ALONE)
     assert outputs(out) == outputs(tmp_path / "fresh")
+
+
+@pytest.mark.slow
+@pytest.mark.needs("distributed")
+def test_what_changed_is_made_again_on_a_cluster(drive, made, tmp_path):
+    """Scans, a capture, a finer grid, an export, and another data set."""
+    with open_cluster("local:2") as cluster:
+        run = Run(executor=cluster)
+
+        def check(command, change, *out: Path) -> None:
+            command(out[0], run)
+            change()
+            command(out[0], run)
+            command(out[1], ALONE)
+            assert outputs(out[0]) == outputs(out[1])
+
+        def grids(source, **options):
+            return lambda out, run: regrid(source, SPEC, out, run=run, **options)
+
+        def pair(name: str) -> tuple[Path, Path]:
+            return tmp_path / name, tmp_path / f"{name}-fresh"
+
+        given = copy(drive, tmp_path / "given")
+        rng = np.random.default_rng(0)
+        check(grids(given, observe=STILL), lambda: change_points(given, rng), *pair("scans"))
+        aligned = FromScans(window=(-2, 2), poses=PoseOptions("file", "always"))
+        check(grids(given, observe=aligned), lambda: change_labels(given, rng), *pair("aligned"))
+
+        write_capture(tmp_path / "town", frames=4)
+        labels = tmp_path / "town/raw/labels1/102.npy"
+        recolour = lambda: np.save(labels, np.full_like(np.load(labels), 3))  # noqa: E731
+        check(grids(tmp_path / "town"), recolour, *pair("capture"))
+
+        (grid,) = scans(made).glob("evaluation*/000003.label")
+        coarse = SPEC.with_size((16, 16, 4))
+        check(
+            lambda out, run: regrid(made, coarse, out, observe=FromGrid(), run=run),
+            lambda: grid.write_bytes(bytes(grid.stat().st_size)),
+            *pair("coarse"),
+        )
+        check(
+            lambda out, run: export("kitti", made, out, run=run),
+            lambda: change_points(made, rng),
+            *pair("exported"),
+        )
+
+        folder = write_tiny_kitti(tmp_path / "kitti", frames=3, points=400)
+        path = folder / "labels/000001.label"
+        check(
+            lambda out, run: convert(
+                "kitti", tmp_path / "kitti", out, grids=None, poses=FORCED, run=run
+            ),
+            lambda: path.write_bytes(np.roll(np.fromfile(path, "<u4"), 7).tobytes()),
+            *pair("converted"),
+        )
 
 
 @pytest.mark.slow
