@@ -729,11 +729,11 @@ class Work:
             if done.task.frame is not None and done.error is not None:
                 frame = done.task.frame.source_frame
                 self.failures.append(FrameFailure(job.inputs.location, frame, done.error))
+        if job.check.must_record and not made:
+            job.check.begin(job.numbers, ())
         is_reported = not made and job.is_reported()
         if not (is_reported or (self.spread.part.count > 1 and job.missing())):
             self._report(job, made, {done.task.number for done in made})
-        if job.check.must_record and not made:
-            job.check.begin(job.numbers, ())
         if made or job.check.must_record:
             job.check.finish({done.task.number for done in made if done.error is None})
 

@@ -316,6 +316,16 @@ def test_poses_elsewhere_follow(drive, tmp_path, change, source):
     assert outputs(out) == outputs(tmp_path / "fresh")
 
 
+def test_a_capture_without_its_last_frame(tmp_path):
+    write_capture(tmp_path / "data", frames=2)
+    regrid(tmp_path / "data", SPEC, tmp_path / "out", run=ALONE)
+    for path in (tmp_path / "data/raw").glob("*/101.npy"):
+        path.unlink()
+    regrid(tmp_path / "data", SPEC, tmp_path / "out", run=ALONE)
+    regrid(tmp_path / "data", SPEC, tmp_path / "fresh", run=ALONE)
+    assert outputs(tmp_path / "out") == outputs(tmp_path / "fresh")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("frame", [100, 102])
 def test_a_changed_pose_of_a_capture(tmp_path, frame):

@@ -26,6 +26,7 @@ _TEXTS = (".txt", ".json")
 _FRAME = re.compile(r"(\d+)\.[a-z.]+")
 _OTHER_SETTINGS = "expected a grid with the same settings"  # such as another first frame
 _REPAIRED = 0.3  # share of the changes that are taken back
+_ABOUT = ("simulation.json",)  # what carlasc.json says of a data set stays: users complete it
 _STEPS = 16  # bytes: a point, and a multiple of the size of a label
 REPEATED = tuple(
     name
@@ -63,7 +64,7 @@ def _try_command(
         path.relative_to(base).as_posix()
         for name in command.inputs
         for path in sorted([base / name, *(base / name).rglob("*")])
-        if path.is_file() and _RECORDS not in path.parts
+        if path.is_file() and _RECORDS not in path.parts and path.name not in _ABOUT
     ]
     tried, number, found, refused = 0, 0, [], Counter[str]()
     while tried < (count or 1):
