@@ -156,14 +156,18 @@ def write_output(path: Path, content: Content) -> None:
 
     To write many files into a folder, call `remove_stale` once instead.
     """
-    _remove_ended(path.parent.glob(f".{glob.escape(path.name)}.*{_PART}"))
+    remove_stale_of(path)
     write_atomic(path, content)
+
+
+def remove_stale_of(path: Path) -> None:
+    """Remove what killed processes left of a file that they wrote."""
+    _remove_ended(path.parent.glob(f".{glob.escape(path.name)}.*{_PART}"))
 
 
 @contextmanager
 def temporary_folder(beside: Path) -> Iterator[Path]:
-    """Make a folder beside an output file, and remove it at the end; those of killed runs are
-    removed first.
+    """Make a folder beside an output file, and remove it at the end.
 
     Raises:
         StorageError: it cannot be written to; names the output.
@@ -171,7 +175,6 @@ def temporary_folder(beside: Path) -> Iterator[Path]:
     folder = _temporary(beside)
     try:
         beside.parent.mkdir(parents=True, exist_ok=True)
-        _remove_ended(beside.parent.glob(f".{glob.escape(beside.name)}.*{_PART}"))
         folder.mkdir()
         yield folder
     except OSError as error:

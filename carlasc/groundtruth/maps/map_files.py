@@ -75,13 +75,14 @@ class MapCells:
 @dataclass(frozen=True)
 class MapFiles:
     """The paths of a map: points or tree, mesh, distances, and the folder of actors; None: not
-    written.
+    written. `begin` is called before the first file is written.
     """
 
     out: Path | None
     mesh: Path | None
     distance: Path | None
     actors: Path | None
+    begin: Callable[[], None] = lambda: None
 
     @classmethod
     def of(cls, out: Any, mesh: Any, distance: Any, actors: bool, grid: str | None) -> Self:
@@ -153,6 +154,7 @@ class MapFiles:
         """Write the points, or the tree, and the mesh; `cells` returns the cells of the tree and
         the mesh.
         """
+        self.begin()
         is_tree = self.out is not None and self.out.suffix.lower() == OCTOMAP
         if self.out is not None and not is_tree:
             write_points(self.out, points)

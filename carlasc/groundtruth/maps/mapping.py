@@ -9,7 +9,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -42,7 +42,14 @@ from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
 from carlasc.storage.derived_copies import check_complete
-from carlasc.storage.files import AnyPath, temporary_folder, to_json, write_atomic, writing
+from carlasc.storage.files import (
+    AnyPath,
+    remove_stale_of,
+    temporary_folder,
+    to_json,
+    write_atomic,
+    writing,
+)
 from carlasc.storage.folder import FolderWriter
 from carlasc.storage.inputs import MadeFrom, combined, sequence_states
 from carlasc.storage.protocol import Sequence, Source
@@ -141,9 +148,13 @@ def map(
     states = sequence_states(opened, *([f"{grid}/labels", f"{grid}/counts"] if grid else []))
     record = MadeFrom(combined(settings, motion, poses, sorted(states.items())))
     keeper, kept = FolderWriter(first.parent), f"map-{first.name}"
+    is_ours = MadeFrom.read(keeper, kept) == record
+    remove_stale_of(first)
     if not overwrite and all(path.exists() for path in files.all):
-        check_complete(first, MadeFrom.read(keeper, kept) == record)
-    files.check(overwrite)
+        check_complete(first, is_ours)
+    files.check(overwrite or is_ours)
+    if not overwrite:  # so that the next run continues one that is killed
+        files = replace(files, begin=lambda: record.write(keeper, kept))
     count, bodies, notes = (
         1,
         0,
