@@ -198,10 +198,10 @@ def sequence_states(source: Source, *more: str) -> dict[str, str]:
     for path, sequence in source.sequences().items():
         own = [name for name in sequence.fields() if "/" not in name]
         files = SequenceFiles(sequence, *own, *more)
-        texts = [(name, sequence.read_document(name)) for name in sequence.documents()]
+        frames = {frame for name in files.fields for frame in sequence.frames(name).tolist()}
+        texts = [name for name in sequence.documents() if "/" not in name]
         states[path] = combined(
-            _states(files, sequence.scan_frames().tolist()),
-            [text for text in texts if "/" not in text[0]],
+            _states(files, sorted(frames)), [(name, sequence.read_document(name)) for name in texts]
         )
     return states
 
