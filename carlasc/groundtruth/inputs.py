@@ -479,14 +479,12 @@ class InputCheck:
         if not self._whole:
             return
         record, writer = self._record, self.writer
+        is_copy = os.path.realpath(writer.location) != os.path.realpath(self.inputs.location)
         if self.gone:
-            is_copy = os.path.realpath(writer.location) != os.path.realpath(self.inputs.location)
             written = [f"{self.grid}/{part}" for part in layout.GRID_FIELDS]
             writer.remove_frames([*(layout.SCAN_FIELDS if is_copy else ()), *written], self.gone)
-            of_frames = {layout.POSES: self.inputs.poses(), layout.TIMES: self.inputs.times()}
-            for name, lines in of_frames.items():
-                if left := agree_lines(writer, name, lines, is_whole=True):
-                    writer.write_document(name, left)
+        if self.changed and is_copy:
+            self._remove_others()
         for frame in self.gone:
             del record.frames[str(frame)]
         record.frames |= {
@@ -497,6 +495,22 @@ class InputCheck:
         # only a run that ends says that all frames and the report are of these inputs
         record.own, record.whole = self._own, "" if self.changed or self.stale else self._whole
         record.write(self.writer, self._name)
+
+    def _remove_others(self) -> None:
+        """Remove from a copy the lines, text files and fields that the input has no longer."""
+        inputs, writer = self.inputs, self.writer
+        of_frames = {layout.POSES: inputs.poses(), layout.TIMES: inputs.times()}
+        for name, lines in of_frames.items():
+            if self.gone and (left := agree_lines(writer, name, lines, is_whole=True)):
+                writer.write_document(name, left)
+        for name, content in ((layout.TIMES, inputs.times()), (layout.CAMERAS, inputs.cameras())):
+            if content is None:
+                writer.remove_document(name)
+        for frame in inputs.frames:
+            if frame.number in self.stale:
+                others = {*layout.SCAN_FIELDS} - {*frame.fields()}
+                if there := [name for name in others if writer.has(name, frame.number)]:
+                    writer.remove_frames(there, [frame.number])
 
     def finish(self, made: Collection[int]) -> None:
         """Complete the record, after the frames and the report were written.

@@ -15,9 +15,12 @@ from helpers.scenes.passing_car import write_sequence
 import carlasc
 from carlasc import FromGrid, FromScans, GridSpec, Run, Voting, regrid
 from carlasc.converting import convert, export
+from carlasc.core import CameraModel
 from carlasc.errors import ArgumentError
 from carlasc.motion import PoseOptions
 from carlasc.running import Part, open_cluster
+from carlasc.storage import layout
+from carlasc.storage.camera_files import cameras_to_json
 
 SPEC = GridSpec("cartesian", (32, 32, 8), (-12.8, -12.8, -2.0), (12.8, 12.8, 1.2))
 FRAMES = 9
@@ -174,6 +177,32 @@ def test_a_report_follows_the_text_files(made, tmp_path):
     regrid(made, SPEC, observe=STILL, run=ALONE)
     regrid(fresh, SPEC, observe=STILL, run=ALONE)
     assert outputs(made) == outputs(fresh)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", ["", ".zarr"])
+def test_files_that_the_input_lost_are_removed_from_a_copy(drive, tmp_path, ending):
+    source, out = copy(drive, tmp_path / "data"), tmp_path / f"out{ending}"
+    camera = CameraModel(
+        name="front",
+        width=64,
+        height=32,
+        matrix=np.diag([40.0, 40.0, 1.0]),
+        sensor_T_camera=np.eye(4),
+    )
+    (scans(source) / "cameras.json").write_bytes(cameras_to_json([camera]))
+    picture = layout.field_named("bev").file(3)
+    (scans(source) / picture).parent.mkdir()
+    (scans(source) / picture).write_bytes(b"a picture")
+    regrid(source, SPEC, out, observe=STILL, run=ALONE)
+    for name in ("times.txt", "cameras.json", picture):
+        (scans(source) / name).unlink()
+    regrid(source, SPEC, out, observe=STILL, run=ALONE)
+    regrid(source, SPEC, tmp_path / "fresh", observe=STILL, run=ALONE)
+    if ending:
+        carlasc.unpack(out, tmp_path / "unpacked", run=ALONE)
+        out = tmp_path / "unpacked"
+    assert outputs(out) == outputs(tmp_path / "fresh")
 
 
 @pytest.mark.slow

@@ -166,6 +166,10 @@ class ZarrWriter(SequenceWriter):
         self._start()
         self.target.put(path, data)
 
+    def remove_document(self, name: str) -> None:
+        """Remove a text file, if it exists."""
+        self.target.remove(self._document(name))
+
     def create_document(self, name: str, data: bytes) -> bool:
         """Write a text file unless it exists."""
         path = self._document(name)
