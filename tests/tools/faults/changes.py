@@ -182,7 +182,12 @@ def _values(path: Path, rng: np.random.Generator) -> bool:
     if path.suffix not in (".bin", ".label", ".npy") or len(data) < 256:
         return False
     start = 128 // _STEPS + int(rng.integers((len(data) - 128) // _STEPS))
-    data[start * _STEPS + (5 if path.parent.name.startswith("pose") else 0)] ^= 1
+    if path.parent.name.startswith("pose"):
+        pose = np.load(path)
+        pose[rng.integers(3), 3] += 0.001
+        np.save(path, pose)
+        return True
+    data[start * _STEPS] ^= 1
     path.write_bytes(data)
     return True
 
