@@ -141,20 +141,20 @@ def _inputs_of(sequence: Sequence, grid: str) -> SequenceInput | None:
     made = sequence.params(grid).get(RECORD)
     if not isinstance(made, dict) or _files(sequence, made)[0] is None:
         return None
-    keep = {
-        f"keep_{name}": f"{grid}/{part}" in sequence.fields()
-        for name, part in (("actors", layout.ACTOR_FIELDS[0]), ("seen", "seen"))
-    }
+    actors, seen = (
+        f"{grid}/{part}" in sequence.fields() for part in (layout.ACTOR_FIELDS[0], "seen")
+    )
+    voting = Voting(keep_actors=actors, keep_seen=seen)
     if made["observe"] == "scans":
         if (scans := inputs_of(sequence, grid)) is not None:
-            scans.plan = replace(scans.plan, voting=replace(scans.plan.voting, **keep))
+            scans.plan = replace(scans.plan, voting=replace(voting, rule=scans.plan.rule))
         return scans
     observe = FromGrid(made["grid"]) if made["observe"] == "grid" else FromCapture()
     frames = FrameRange.of(made.get("frames"))
-    plan = GridPlan(sequence.grids[grid], grid, observe, Voting(**keep), frames)
-    if made["observe"] == "grid":
-        return ResampledSequence(sequence, made["grid"], plan)
-    return CaptureSequence(Capture(sequence.folder.parent), "", plan)
+    plan = GridPlan(sequence.grids[grid], grid, observe, voting, frames)
+    if isinstance(sequence, FolderSequence) and made["observe"] == "capture":
+        return CaptureSequence(Capture(sequence.folder.parent), "", plan)
+    return ResampledSequence(sequence, made["grid"], plan)
 
 
 def changed_inputs(sequence: Sequence, grid: str) -> str:
