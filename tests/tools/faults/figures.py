@@ -72,6 +72,14 @@ KINDS = {
         200,
         5_000,
     ),
+    "large": Kind(
+        "faults.large",
+        "commands on large data",
+        "Frames, sequences, points of a scan and voxels double twice: in the second doubling, an "
+        "item costs no more time and memory than in the first",
+        1,
+        1_000,
+    ),
     "mutations": Kind(
         "faults.mutations",
         "damaged files",
