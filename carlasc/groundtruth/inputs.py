@@ -30,6 +30,7 @@ from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.camera_files import cameras_of, scan_T_camera
 from carlasc.storage.inputs import (
+    ACCEPTED,
     FrameFiles,
     MadeFrom,
     SequenceFiles,
@@ -421,6 +422,9 @@ class InputCheck:
         if not self.changed and all(recorded.values()):
             return
         inputs.prepare(self.writer, run, StepCounter(None))
+        if all(self._own.get(frame, own) == own for frame, own in record.own.items()):
+            accepted = [frame for frame, made in recorded.items() if made == ACCEPTED]
+            recorded |= {frame: self._made_from(frame) for frame in accepted}
         self.gone = {int(frame) for frame in record.frames} - set(inputs.available())
         self.stale = {
             frame for frame, made in recorded.items() if made not in (None, self._made_from(frame))
@@ -490,7 +494,9 @@ class InputCheck:
         record.frames |= {
             str(frame): "" if frame in self.stale else self._made_from(frame)
             for frame in sorted(numbers)
-            if frame in missing or frame in self.stale or str(frame) not in record.frames
+            if frame in missing
+            or frame in self.stale
+            or record.frames.get(str(frame), ACCEPTED) == ACCEPTED
         }
         # only a run that ends says that all frames and the report are of these inputs
         record.own, record.whole = self._own, "" if self.changed or self.stale else self._whole

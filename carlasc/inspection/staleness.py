@@ -5,8 +5,6 @@ now, by the records of what they were made from.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,9 +13,9 @@ from carlasc.core.frames import FrameRange
 from carlasc.errors import ArgumentError, CarlascError, count
 from carlasc.inspection.findings import Finding, Severity
 from carlasc.running.spreading import Run
-from carlasc.storage import layout
 from carlasc.storage.folder import FolderSequence, FolderWriter
 from carlasc.storage.inputs import (
+    ACCEPTED,
     FrameFiles,
     MadeFrom,
     SequenceFiles,
@@ -27,9 +25,6 @@ from carlasc.storage.inputs import (
 )
 from carlasc.storage.protocol import Sequence, SequenceWriter
 from carlasc.storage.resuming import RECORD
-
-if TYPE_CHECKING:
-    from carlasc.groundtruth.inputs import SequenceInput
 
 _SEED = 0
 _ADVICE = "make the grid again with the command that made it: it makes what changed again"
@@ -100,90 +95,70 @@ def check_sample(sequence: Sequence, count: int, run: Run) -> Iterator[Finding]:
         yield Finding(kind, "inputs", where, expected, found, advice)
 
 
-def record_inputs(sequence: Sequence, run: Run) -> Iterator[Finding]:
-    """Write the record of what grids were made from, of frames without one, as if they were made
-    of the inputs as they are now; and yield a note for each grid.
+def record_inputs(sequence: Sequence) -> Iterator[Finding]:
+    """Accept the frames of grids without a record of what they were made from, as made of the
+    inputs as they are now; and yield a note for each grid.
 
     Raises:
         ArgumentError: such a grid is not in a folder.
     """
-    from carlasc.groundtruth.inputs import InputCheck  # compiled code, which `info` does not need
-
     for grid in sequence.grids:
-        frames = {*sequence.frames(f"{grid}/labels").tolist()}
-        writer = _Records(sequence)
-        unknown = frames - {*map(int, MadeFrom.read(writer, f"made-{grid}").frames)}
-        inputs = _inputs_of(sequence, grid) if unknown else None
-        if inputs is None:
+        frames, record = sequence.frames(f"{grid}/labels").tolist(), _record(sequence, grid)
+        unknown = [frame for frame in frames if str(frame) not in record.frames]
+        now = _own_now(sequence, grid, record)
+        if not unknown or not now or changed_inputs(sequence, grid):
             continue
         if not isinstance(sequence, FolderSequence):
             found = sequence.location
             raise ArgumentError("record", expected="a folder, which keeps records", found=found)
-        check = InputCheck(inputs, FolderWriter(sequence.folder), grid, "fast")
-        check.look(frames, lambda frame: True, run)
-        if check.stale:  # they are made again
-            continue
-        check.begin(frames, ())
-        check.finish(())
+        accepted = {str(frame): ACCEPTED for frame in unknown}
+        accepted_record = MadeFrom(record.whole, record.own or now, record.frames | accepted)
+        accepted_record.write(FolderWriter(sequence.folder), f"made-{grid}")
         found = f"none of {count(len(unknown), 'frame')}: they count as made of the inputs of now"
         where, expected = f"{sequence.location}/{grid}", "a record of what frames were made from"
         yield Finding("note", "inputs", where, expected, found)
-
-
-def _inputs_of(sequence: Sequence, grid: str) -> SequenceInput | None:
-    """Return the inputs of a grid, if they are beside it."""
-    from carlasc.groundtruth.from_capture import CaptureSequence
-    from carlasc.groundtruth.from_grid import ResampledSequence
-    from carlasc.groundtruth.inputs import GridPlan
-    from carlasc.groundtruth.options import FromCapture, FromGrid, Voting
-    from carlasc.inspection.reports import inputs_of
-
-    made = sequence.params(grid).get(RECORD)
-    if not isinstance(made, dict) or _files(sequence, made)[0] is None:
-        return None
-    actors, seen = (
-        f"{grid}/{part}" in sequence.fields() for part in (layout.ACTOR_FIELDS[0], "seen")
-    )
-    voting = Voting(keep_actors=actors, keep_seen=seen)
-    if made["observe"] == "scans":
-        if (scans := inputs_of(sequence, grid)) is not None:
-            scans.plan = replace(scans.plan, voting=replace(voting, rule=scans.plan.rule))
-        return scans
-    observe = FromGrid(made["grid"]) if made["observe"] == "grid" else FromCapture()
-    frames = FrameRange.of(made.get("frames"))
-    plan = GridPlan(sequence.grids[grid], grid, observe, voting, frames)
-    if isinstance(sequence, FolderSequence) and made["observe"] == "capture":
-        return CaptureSequence(Capture(sequence.folder.parent), "", plan)
-    return ResampledSequence(sequence, made["grid"], plan)
 
 
 def changed_inputs(sequence: Sequence, grid: str) -> str:
     """Return what changed of the inputs of a grid since it was made, such as "scan 12 changed";
     empty if nothing did, or if it is not known.
     """
-    writer, made = _Records(sequence), sequence.params(grid).get("carlasc")
-    record = MadeFrom.read(writer, f"made-{grid}")
-    if not record.own or not isinstance(made, dict):
+    record = _record(sequence, grid)
+    if not record.own or not (now := _own_now(sequence, grid, record)):
         return ""
+    # an output may have a part of the scans only, but none that its input has not
+    is_capture = sequence.params(grid)[RECORD]["observe"] == "capture"
+    required = record.own if is_capture else record.frames
+    before = {frame: own for frame, own in record.own.items() if frame in now or frame in required}
+    return describe_changes(before, now)
+
+
+def _record(sequence: Sequence, grid: str) -> MadeFrom:
+    return MadeFrom.read(_Records(sequence), f"made-{grid}")
+
+
+def _own_now(sequence: Sequence, grid: str, record: MadeFrom) -> dict[str, str]:
+    """Return the digests of the frames that a grid is made from, those of its record if it has one;
+    none if they are not known.
+    """
+    made = sequence.params(grid).get(RECORD)
     try:
-        files, known = _files(sequence, made)
+        files, known = _files(sequence, made) if isinstance(made, dict) else (None, [])
         if files is None:
-            return ""
+            return {}
         window = [int(end) for end in str(made.get("window", "0:0")).split(":")]
         near = {int(n) + i for n in record.frames for i in range(window[0], window[1] + 1)}
-        wanted = [frame for frame in known if str(frame) in record.own or frame in near]
-        contents = content_digests(files, wanted, writer)
+        wanted = [
+            frame for frame in known if not record.own or str(frame) in record.own or frame in near
+        ]
+        contents = content_digests(files, wanted, _Records(sequence))
         estimated = made.get("poses") == "kiss-icp"
-        now = {
+        return {
             str(frame): combined(content, _about(sequence, made["observe"], frame, estimated))
             for frame, content in contents.items()
         }
     except (CarlascError, OSError, KeyError, ValueError):  # which other checks report
-        return ""
-    # an output may have a part of the scans only, but none that its input has not
-    required = record.own if made["observe"] == "capture" else record.frames
-    before = {frame: own for frame, own in record.own.items() if frame in now or frame in required}
-    return describe_changes(before, now)
+        return {}
 
 
 def _files(sequence: Sequence, made: Mapping[str, object]) -> tuple[FrameFiles | None, list[int]]:

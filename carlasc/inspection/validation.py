@@ -186,7 +186,7 @@ def validate(
     else:
         examined = run_all(_examine, plans, run, lost=_fail)
     for plan, (in_sequence, report) in zip(plans, examined, strict=True):
-        more = [*in_sequence, *(record_inputs(plan.sequence, run) if record else ())]
+        more = [*in_sequence, *(record_inputs(plan.sequence) if record else ())]
         more += check_sample(plan.sequence, sample, run) if sample > 0 else ()
         named = [replace(finding, sequence=plan.sequence.path) for finding in more]
         findings += sorted(named, key=lambda finding: SEVERITIES.index(finding.severity))

@@ -32,6 +32,8 @@ from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 from carlasc.storage.transport.trees import Tree
 
+ACCEPTED = "accepted"
+"""In the place of the digest of a frame: it counts as made of the inputs in the record."""
 _FORMAT = 1
 _BYTES = 16  # of the digest of a file
 _SHORT = 8  # bytes of the digests in records
