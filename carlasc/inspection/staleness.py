@@ -142,8 +142,10 @@ def _own_now(sequence: Sequence, grid: str, record: MadeFrom) -> dict[str, str]:
     none if they are not known.
     """
     made = sequence.params(grid).get(RECORD)
+    if not isinstance(made, dict):
+        return {}
     try:
-        files, known = _files(sequence, made) if isinstance(made, dict) else (None, [])
+        files, known = _files(sequence, made)
         if files is None:
             return {}
         window = [int(end) for end in str(made.get("window", "0:0")).split(":")]
