@@ -184,7 +184,8 @@ def map(
     keeper, kept = FolderWriter(first.parent), f"map-{first.name}"
     is_ours, place = MadeFrom.read(keeper, kept) == record, first.parent / layout.DERIVED
     place /= f"recording-{first.name}"
-    remove_stale_of(first)
+    for path in (first, first.parent / layout.record_file(kept)):
+        remove_stale_of(path)
     if not overwrite and all(path.exists() for path in files.all):
         if is_ours:  # a run that was killed at its end leaves it
             shutil.rmtree(place, ignore_errors=True)
