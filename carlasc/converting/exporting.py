@@ -50,7 +50,6 @@ from carlasc.storage.files import (
 )
 from carlasc.storage.folder import FolderWriter
 from carlasc.storage.inputs import (
-    UNKNOWN,
     MadeFrom,
     SequenceFiles,
     combined,
@@ -176,7 +175,7 @@ def export(
             elif inputs.is_known or not exists:
                 inputs.write()
             elif not overwrite and compare_inputs != "never":
-                notes.append(f"{root / exported.folder}: {UNKNOWN}")
+                notes.append(f"{root / exported.folder}: {_UNKNOWN}")
             failed = len(writing.failures)
             writing.add(exported, again=inputs.changed)
             # otherwise, frames of before may still be there
@@ -284,6 +283,10 @@ def _exists(exporter: Exporter, sequence: storage.Sequence, frame: int, folder: 
     return all(has_content(folder / file) for file in files)
 
 
+_UNKNOWN = (
+    "there is no record of what existing frames were made from: they are kept; "
+    '`compare_inputs="content"` compares them'
+)
 _TEXTS = "-1"  # in the place of a frame: files that belong to no single frame
 
 

@@ -40,7 +40,6 @@ from carlasc.running.processes import one_pool
 from carlasc.running.spreading import Part, Run, StepCounter
 from carlasc.storage.files import AnyPath
 from carlasc.storage.inputs import (
-    UNKNOWN,
     MadeFrom,
     changed_names,
     combined,
@@ -56,6 +55,7 @@ from carlasc.storage.transport.trees import LocalTarget
 Grids = GridOptions | Literal["voxels"] | None
 _RECORD = "conversion"
 _GAP = "gap"  # in the record: a frame that failed, and others were finished without it
+_UNKNOWN = "there was no record of what frames were made from, so all were compared"
 _LOOKED_AT = (
     3  # number of sequences, and of scans of each, in which points outside of the grid are counted
 )
@@ -258,21 +258,18 @@ class _ConvertedFrom:
             return
         exists = len(plan.missing) < len(plan.recording.frames)
         is_other = before.own != states or _GAP in before.frames.values()
-        if exists and (compare == "content" or (before.whole and is_other)):
-            plan.make_again()
-        elif exists and not before.whole:
-            self.states = None
-            self.notes.append(f"{plan.writer.location}: {UNKNOWN}")
+        if exists and (compare == "content" or is_other):
+            plan.make_again(is_same=bool(before.own.items() & states.items()))
         else:
             self._write(())
 
     def finish(self, conversion: Conversion) -> None:
         """Write the record, after the frames were written."""
         if self.plan.again:
-            conversion.remove_others(map(int, self._before.frames))
-            if conversion.changed:
-                why = changed_names(self._before.own, self.states or {})
-                where = self.plan.writer.location
+            before, where = self._before, self.plan.writer.location
+            conversion.remove_others(map(int, before.frames))
+            if conversion.changed or not before.own:
+                why = changed_names(before.own, self.states or {}) if before.own else _UNKNOWN
                 self.notes.append(f"{where}: {made_again(conversion.changed, why)}")
         has_gaps = conversion.allow_gaps or self.plan.pose_source == KISS_ICP
         self._write(conversion.failed if has_gaps else ())

@@ -285,15 +285,19 @@ def _prepare(
     params = parse_json(to_json(settings), plan.grid)  # as a later run reads it
     numbers = [frame.number for frame in inputs.frames]
     exists = check_grid(writer, plan.grid, params, numbers, overwrite=overwrite)
+    check = InputCheck(inputs, writer, plan.grid, compare)
     documents = {
         layout.METADATA: agree_metadata(writer, inputs.metadata),
-        layout.POSES: agree_lines(writer, layout.POSES, inputs.poses()),
-        layout.TIMES: agree_lines(writer, layout.TIMES, inputs.times()),
+        layout.POSES: agree_lines(
+            writer, layout.POSES, inputs.poses(), may_change=check.is_of_input
+        ),
+        layout.TIMES: agree_lines(
+            writer, layout.TIMES, inputs.times(), may_change=check.is_of_input
+        ),
         layout.CAMERAS: None if cameras == writer.read_document(layout.CAMERAS) else cameras,
         layout.params_file(plan.grid): to_json(params),
     }
     needed = {name: data for name, data in documents.items() if data is not None}
-    check = InputCheck(inputs, writer, plan.grid, compare)
     replaces = exists and overwrite
     return SequenceJob(path, inputs, plan, writer, needed, params, replaces, check)
 
@@ -576,6 +580,23 @@ class SequenceJob:
             )
         )
 
+    def _documents(self) -> dict[str, bytes]:
+        """Return the text files that a report is made from."""
+        names = (layout.POSES, layout.TIMES, layout.METADATA, layout.params_file(self.plan.grid))
+        found = {name: self.writer.read_document(name) for name in names}
+        return {name: data for name, data in found.items() if data is not None}
+
+    def is_reported(self) -> bool:
+        """Whether the report covers all frames, and its text files are those of now."""
+        report, now = self.report(), self._documents()
+        return (
+            report is not None
+            and not self.check.changed
+            and set(report.frames) >= self.numbers
+            and report.documents.keys() == now.keys()
+            and all(report.documents[name].matches(data) for name, data in now.items())
+        )
+
     def report(self) -> Report | None:
         """Return the report of an earlier run with the same settings; None without one."""
         name = layout.report_file(self.plan.grid)
@@ -613,11 +634,7 @@ class SequenceJob:
     def write_report(self, results: Series[FrameResult]) -> None:
         """Write the report, if anything was made or measured."""
         facts = [done.facts for done in results if done.facts is not None]
-        grid, writer = self.plan.grid, self.writer
-        names = (layout.POSES, layout.TIMES, layout.METADATA, layout.params_file(grid))
-        documents = {
-            name: data for name in names if (data := writer.read_document(name)) is not None
-        }
+        grid, writer, documents = self.plan.grid, self.writer, self._documents()
         if facts:
             inputs = self.inputs
             classes, actors, poses = (
@@ -712,13 +729,11 @@ class Work:
             if done.task.frame is not None and done.error is not None:
                 frame = done.task.frame.source_frame
                 self.failures.append(FrameFailure(job.inputs.location, frame, done.error))
-        report, tried = job.report(), {done.task.number for done in made}
-        is_reported = report is not None and set(report.frames) >= job.numbers
-        is_reported &= not made and not job.check.changed
-        if not (is_reported or (self.spread.part.count > 1 and job.missing())):
-            self._report(job, made, tried)
         if job.check.must_record and not made:
             job.check.begin(job.numbers, ())
+        is_reported = not made and job.is_reported()
+        if not (is_reported or (self.spread.part.count > 1 and job.missing())):
+            self._report(job, made, {done.task.number for done in made})
         if made or job.check.must_record:
             job.check.finish({done.task.number for done in made if done.error is None})
 

@@ -46,7 +46,7 @@ from carlasc.inspection.soundness import (
     record_accepted,
     untested,
 )
-from carlasc.inspection.staleness import check_inputs, check_sample
+from carlasc.inspection.staleness import check_inputs, check_sample, record_inputs
 from carlasc.motion.ground import ground_of
 from carlasc.motion.odometry import DRIFT_M
 from carlasc.running.processes import run_all
@@ -144,6 +144,7 @@ def validate(
     every: int | None = None,
     accept: Collection[str] = (),
     sample: int = 0,
+    record: bool = False,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> ValidationResult:
     """Check a data set: files against each other, values, poses, times, and scans against poses and
@@ -161,6 +162,8 @@ def validate(
             sequence then says so.
         sample: number of frames of each grid that are made again from the scans beside it and
             compared.
+        record: accept grids without a record of what they were made from: write the record of the
+            inputs as they are now.
         run: how the work is spread over the sequences, with a callback for progress.
 
     Returns:
@@ -168,7 +171,7 @@ def validate(
 
     Raises:
         ArgumentError: `every` is less than 1, no check has the name of an accepted one, or the data
-            are not in a folder, so that they cannot say what was accepted.
+            are not in a folder, so that they cannot say what was accepted or recorded.
         MissingDataError: there is no data set.
     """
     check_types(validate, locals())
@@ -184,10 +187,9 @@ def validate(
     else:
         examined = run_all(_examine, plans, run, lost=_fail)
     for plan, (in_sequence, report) in zip(plans, examined, strict=True):
-        named = [replace(finding, sequence=plan.sequence.path) for finding in in_sequence]
-        if sample > 0:
-            path, more = plan.sequence.path, check_sample(plan.sequence, sample, run)
-            named += [replace(finding, sequence=path) for finding in more]
+        more = [*in_sequence, *(record_inputs(plan.sequence) if record else ())]
+        more += check_sample(plan.sequence, sample, run) if sample > 0 else ()
+        named = [replace(finding, sequence=plan.sequence.path) for finding in more]
         findings += sorted(named, key=lambda finding: SEVERITIES.index(finding.severity))
         reports.append(report)
         if not run.is_alone:

@@ -207,9 +207,11 @@ class DerivedCopy:
             settings = {"source": source.location, "kind": kind, "inputs": inputs, **made_from}
             if not overwrite and has_content(record := Path(out) / _RECORD):
                 check_complete(out, record.read_bytes() == to_json(settings))
-            _clear(Path(out), kind, is_kind, overwrite=overwrite)
-            with _naming_replaced(Path(out)):
-                self.mark = _mark(unfinished(Path(out)), settings, overwrite=overwrite)
+            _check_replaceable(Path(out), kind, is_kind, overwrite=overwrite)
+            self.mark = _mark(unfinished(Path(out)), settings, overwrite=overwrite)
+            if Path(out).exists():  # an older copy, which is removed when the new one is complete
+                remove(replaced(Path(out)))
+                Path(out).rename(replaced(Path(out)))
 
     def writer(self, path: str) -> SequenceWriter | None:
         """Return the writer for data derived from a sequence, kept until the copy is complete; None
@@ -273,8 +275,10 @@ def check_complete(out: AnyPath, is_complete: bool) -> None:
         raise CompleteError(out, problem=problem, advice=advice)
 
 
-def _clear(out: Path, kind: str, is_kind: Callable[[Metadata], bool], *, overwrite: bool) -> None:
-    """Move an older copy aside, if it may be replaced. It is removed when the new copy is complete.
+def _check_replaceable(
+    out: Path, kind: str, is_kind: Callable[[Metadata], bool], *, overwrite: bool
+) -> None:
+    """Check that nothing is at `out`, or an older copy that may be replaced.
 
     Raises:
         ConflictError: the existing files may not be replaced.
@@ -289,8 +293,6 @@ def _clear(out: Path, kind: str, is_kind: Callable[[Metadata], bool], *, overwri
     ):
         expected, advice = f"a data set with {kind} to overwrite", "choose another name"
         raise ConflictError(out, expected=expected, found="something else", advice=advice)
-    remove(replaced(out))
-    out.rename(replaced(out))
 
 
 def _mark(folder: Path, settings: Mapping[str, Any], *, overwrite: bool) -> Path:

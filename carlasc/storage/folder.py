@@ -240,6 +240,10 @@ class FolderWriter(SequenceWriter):
         """Write a text file."""
         self.target.put(name, data)
 
+    def remove_document(self, name: str) -> None:
+        """Remove a text file, if it exists."""
+        self.target.remove(name)
+
     def create_document(self, name: str, data: bytes) -> bool:
         """Write a text file unless it exists. An empty one is replaced."""
         if data and self.target.read(name) == b"":

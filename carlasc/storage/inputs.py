@@ -32,11 +32,8 @@ from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 from carlasc.storage.transport.trees import Tree
 
-UNKNOWN = (
-    "there is no record of what existing frames were made from: they are kept; "
-    '`compare_inputs="content"` compares them'
-)
-"""The note on outputs of an older version, or whose record was deleted."""
+ACCEPTED = "accepted"
+"""In the place of the digest of a frame: it counts as made of the inputs in the record."""
 _FORMAT = 1
 _BYTES = 16  # of the digest of a file
 _SHORT = 8  # bytes of the digests in records
@@ -203,10 +200,10 @@ def sequence_states(source: Source, *more: str) -> dict[str, str]:
     for path, sequence in source.sequences().items():
         own = [name for name in sequence.fields() if "/" not in name]
         files = SequenceFiles(sequence, *own, *more)
-        texts = [(name, sequence.read_document(name)) for name in sequence.documents()]
+        frames = {frame for name in files.fields for frame in sequence.frames(name).tolist()}
+        texts = [name for name in sequence.documents() if "/" not in name]
         states[path] = combined(
-            _states(files, sequence.scan_frames().tolist()),
-            [text for text in texts if "/" not in text[0]],
+            _states(files, sorted(frames)), [(name, sequence.read_document(name)) for name in texts]
         )
     return states
 

@@ -591,6 +591,9 @@ class SequenceWriter(ABC):
     def write_document(self, name: str, data: bytes) -> None:
         """Write the bytes of a text file; an existing file is replaced."""
 
+    def remove_document(self, name: str) -> None:  # noqa: B027 (finished stores cannot change)
+        """Remove a text file, if it exists and the store can remove it."""
+
     def create_document(self, name: str, data: bytes) -> bool:
         """Write a text file unless it exists, and return whether it was written.
 

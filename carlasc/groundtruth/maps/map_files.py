@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,7 @@ from carlasc.groundtruth.maps.cloud_files import (
     write_octomap,
     write_points,
 )
-from carlasc.storage.files import AnyPath, write_output, writing
+from carlasc.storage.files import AnyPath, write_output
 
 OCTOMAP = ".bt"
 ACTORS = "actors.json"
@@ -76,13 +75,14 @@ class MapCells:
 @dataclass(frozen=True)
 class MapFiles:
     """The paths of a map: points or tree, mesh, distances, and the folder of actors; None: not
-    written.
+    written. `begin` is called before the first file is written.
     """
 
     out: Path | None
     mesh: Path | None
     distance: Path | None
     actors: Path | None
+    begin: Callable[[], None] = lambda: None
 
     @classmethod
     def of(cls, out: Any, mesh: Any, distance: Any, actors: bool, grid: str | None) -> Self:
@@ -150,21 +150,11 @@ class MapFiles:
             if needed:
                 import_extra(module, extra)
 
-    def folder(self) -> tempfile.TemporaryDirectory[str]:
-        """Return a folder beside the map for cells that do not fit into memory; it is removed at
-        the end, also after Ctrl-C.
-        """
-        place = self.all[0].parent
-        with writing(place):
-            place.mkdir(parents=True, exist_ok=True)
-            return tempfile.TemporaryDirectory(
-                dir=place, prefix=f".{self.all[0].name}.", suffix=".part"
-            )
-
     def write(self, points: PointPieces, cells: Callable[[], MapCells]) -> None:
         """Write the points, or the tree, and the mesh; `cells` returns the cells of the tree and
         the mesh.
         """
+        self.begin()
         is_tree = self.out is not None and self.out.suffix.lower() == OCTOMAP
         if self.out is not None and not is_tree:
             write_points(self.out, points)

@@ -37,7 +37,7 @@ from carlasc.motion.tracks import MovingActors
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
-from carlasc.storage.files import to_json, write_atomic, writing
+from carlasc.storage.files import temporary_folder, to_json, write_atomic, writing
 from carlasc.storage.protocol import Source
 
 
@@ -70,8 +70,8 @@ def write_map(
     `carlasc.map`.
     """
     options = FromScans(window=(0, 0), motion=motion, poses=poses)
-    with files.folder() as folder:
-        drive = DriveMap.of(source, frames, options, GrowingCells(Path(folder), cell_m))
+    with temporary_folder(files.all[0]) as folder:  # of cells that do not fit into memory
+        drive = DriveMap.of(source, frames, options, GrowingCells(folder, cell_m))
         drive.fill(run, files.actors is not None)
         points, bodies = drive.write(files), 0
         if files.actors is not None and files.out is not None:

@@ -39,8 +39,12 @@ ERRORS = {
     errno.EDQUOT: preload.ALL & ~Kind.READ,
 }
 """The error numbers, and the calls that fail with them."""
-ALONE = [name for name, command in COMMANDS.items() if command.workers in (None, 1)]
-"""Commands that work in one process: calls of others cannot be numbered."""
+ALONE = [
+    name
+    for name, command in COMMANDS.items()
+    if command.workers in (None, 1) and not command.slow and name != "capture"
+]
+"""Commands that work in one process and thread: calls of others cannot be numbered."""
 
 GOES_ON = ("convert", "convert-zarr", "convert-parquet", "regrid-hdf5", "regrid-parquet")
 """Commands that go on past a frame of the input that cannot be read, and whose next run does not
@@ -68,7 +72,7 @@ def run(count: int, seed: int, folder: Path, names: Sequence[str] | None = None)
     """
     began = time.monotonic()
     tried, found = run_with_library("faults.calls", count, seed, folder, names or ALONE)
-    return Outcome("calls", tried, found, time.monotonic() - began)
+    return Outcome.of("calls", began, tried, found)
 
 
 def _try_command(
@@ -174,7 +178,7 @@ def _try_call(
         faults += [
             f"{name} is left"
             for name in found
-            if _is_temporary(name) and Path(name).name.startswith(".")
+            if _is_temporary(name) and re.match(r"\..*\.part", Path(name).name)
         ]
     try:
         again = run_command(command, case)
@@ -217,7 +221,7 @@ def _names(line: str, path: str, case: Path) -> bool:
     store that it is in.
     """
     relative = Path(path).relative_to(case).as_posix()
-    final = re.sub(r"\.([^/]+)\.[^./]+-[0-9]+\.[0-9a-f]{8}\.part$", r"\1", relative)
+    final = re.sub(r"\.([^/]+)\.[^./]+-[0-9]+\.[0-9a-f]{8}\.part(?=/|$)", r"\1", relative)
     names = {final, *(parent.as_posix() for parent in Path(final).parents if parent != Path())}
     return any(name.removesuffix(".part").removesuffix(".replaced") in line for name in names)
 
