@@ -134,7 +134,10 @@ class PredictedFiles:
 
 
 def find_predictions(
-    root: Path, sequences: Mapping[str, Sequence], chosen: FrameRange, left_out: Collection[str] = ()
+    root: Path,
+    sequences: Mapping[str, Sequence],
+    chosen: FrameRange,
+    left_out: Collection[str] = (),
 ) -> dict[str, PredictedFiles]:
     """Return the files of the chosen frames of each sequence. Folders with some names are
     not listed.

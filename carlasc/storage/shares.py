@@ -5,7 +5,7 @@ before any of them is opened.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 
 from carlasc.errors import MissingDataError
@@ -34,7 +34,7 @@ class Share(Source):
             run: how the work on the source is spread.
         """
         self.whole, self.location = whole, whole.location
-        listed = _listed(whole, run) if run.is_share else [""]
+        listed = read_list(run, whole.places) if run.is_share else [""]
         self.own, part = run.part.share(listed)
         own, self.first = {*self.own}, listed[0]
         self.others = [place for place in listed if place not in own]
@@ -52,24 +52,28 @@ def source_in(source: Source, places: Collection[str]) -> Source:
     return ChosenSequences(source.location, source.sequences_in(places))
 
 
-def _listed(source: Source, run: Run) -> list[str]:
-    """Return the folders of a source, from the list of the run if it has one. A list that does not
-    exist is written.
+def read_list(run: Run, places: Callable[[], list[str]]) -> list[str]:
+    """Return the places that a run works on: those of its list, which is written if it does not
+    exist, or all.
+
+    Args:
+        run: the run.
+        places: finds all places.
 
     Raises:
         MissingDataError: the list is empty.
     """
     if run.sequences_from is None:
-        return source.places()
+        return places()
     folder, name = os.path.split(os.fspath(run.sequences_from))
     target = target_of(folder or ".")
     if (data := target.read(name)) is None:
-        lines = "".join(f"{place or '.'}\n" for place in source.places())
+        lines = "".join(f"{place or '.'}\n" for place in places())
         target.put(name, lines.encode(errors="surrogateescape"), create=True)
         data = target.read(name) or b""
     named = data.decode(errors="surrogateescape").splitlines()
-    places = [line.strip().strip("/") for line in named if line.strip()]
-    if not places:
+    found = [line.strip().rstrip("/") for line in named if line.strip()]
+    if not found:
         where = target.tree.where(name)
-        raise MissingDataError(where, expected="folders of sequences, one per line", found="none")
-    return ["" if place == "." else place for place in dict.fromkeys(places)]
+        raise MissingDataError(where, expected="folders, one per line", found="none")
+    return ["" if place == "." else place for place in dict.fromkeys(found)]
