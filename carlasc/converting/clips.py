@@ -195,6 +195,7 @@ def convert_clips(
             for result in clips.run(pool):
                 results.append(result)
                 steps()
+            shutil.rmtree(folder, ignore_errors=True)
     except Timeout:
         advice = "wait for it, or set TMPDIR to another folder"
         raise ArgumentError(folder, expected="no other run", found="one", advice=advice) from None

@@ -262,7 +262,9 @@ def _sequences(
         raise ArgumentError(
             "observe", expected="FromCapture() with a capture", found=repr(plan.observe)
         )
-    opened = source_in(as_source(source), places)
+    opened = as_source(source)
+    if [*places] != [""]:
+        opened = source_in(opened, places)
     if isinstance(plan.observe, FromScans):
         return scan_sequences(opened, plan, plan.observe)
     return resampled_sequences(opened, plan, plan.observe)

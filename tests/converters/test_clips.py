@@ -25,7 +25,7 @@ from carlasc.running import Part
 from carlasc.testing import SimulatedDrive
 
 pytestmark = pytest.mark.needs("cbor2", "numcodecs")
-MANY = int(os.environ.get("CARLASC_TEST_CLIPS", "16"))
+MANY = int(os.environ.get("CARLASC_TEST_CLIPS", "8"))
 
 
 def write_clips(folder: Path, number: int) -> dict[str, bytes]:
@@ -34,7 +34,7 @@ def write_clips(folder: Path, number: int) -> dict[str, bytes]:
     folder.mkdir(exist_ok=True)
     for index in range(number):
         drive = SimulatedDrive(2, channels=6, columns=40)
-        path = write_store(folder, drive, name=f"clip{index:04d}")
+        path = write_store(folder, drive, sequence=f"clip{index:04d}")
         files[f"/{path.name}"] = path.read_bytes()
     return files
 
@@ -94,6 +94,7 @@ def test_a_sequence_of_two_clips_is_a_conflict_and_what_does_not_fit_is_refused(
     assert error.value.where == "out"
 
 
+@pytest.mark.slow
 def test_a_list_is_written_by_the_first_part_and_all_parts_make_one_conversion(tmp_path):
     files = write_clips(tmp_path / "in", 5)
     path = tmp_path / "list"
@@ -123,6 +124,7 @@ def sizes(folder: Path) -> int:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 @pytest.mark.parametrize("server", ["http", "s3"])
 def test_two_killed_machines_convert_many_clips_once_in_bounded_space(tmp_path, server):
     """`CARLASC_TEST_CLIPS=200` for 200 clips."""

@@ -109,7 +109,7 @@ def write_store(
     drive: SimulatedDrive,
     *,
     version: str = "v4",
-    name: str = "drive 1",
+    sequence: str = "drive 1",
     edit: Callable[[dict], object] = bool,
 ) -> Path:
     """Write a store of a sequence, and return its file; `edit` may change what it holds, as `contents` returns
@@ -118,7 +118,7 @@ def write_store(
     `edit` may add "cameras": for each name `lens`, its attributes in the component "intrinsics",
     `rig_T_camera`, and `images`: file and format by (start, end) in microseconds.
     """
-    content, file = contents(drive), f"{name.split()[0]}.ncore4.zarr.itar"
+    content, file = contents(drive), f"{name.split(maxsplit=1)[0]}.ncore4.zarr.itar"
     edit(content)
     members: dict[str, bytes] = {}
     metadata: dict[str, dict] = {}
@@ -132,7 +132,7 @@ def write_store(
 
     metadata[".zgroup"] = {"zarr_format": 2}
     metadata[".zattrs"] = {
-        "sequence_id": name,
+        "sequence_id": sequence,
         "version": version,
         "component_group_name": "",
         "generic_meta_data": {},
