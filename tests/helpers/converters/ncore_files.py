@@ -118,7 +118,7 @@ def write_store(
     `edit` may add "cameras": for each name `lens`, its attributes in the component "intrinsics",
     `rig_T_camera`, and `images`: file and format by (start, end) in microseconds.
     """
-    content, file = contents(drive), f"{name.split(maxsplit=1)[0]}.ncore4.zarr.itar"
+    content, file = contents(drive), f"{sequence.split(maxsplit=1)[0]}.ncore4.zarr.itar"
     edit(content)
     members: dict[str, bytes] = {}
     metadata: dict[str, dict] = {}
