@@ -1,11 +1,17 @@
 """The share of a part: sequences chosen by names, before any is opened."""
 
+import os
+import subprocess
 import sys
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from urllib.parse import parse_qs, urlparse
 
 import numpy as np
 import pytest
 from helpers.datasets.captures import read_tree
 from helpers.errors import raises
+from helpers.servers.object_store import environment_for
 
 import carlasc
 from carlasc import Run
@@ -123,3 +129,69 @@ def test_an_empty_list_and_a_wrong_folder_are_errors(tmp_path):
     (tmp_path / "empty").mkdir()
     with raises(MissingDataError):
         regrid(tmp_path / "empty", SPEC, tmp_path / "out", run=Run(1, part=Part(1, 2)))
+
+
+class ManyFolders(BaseHTTPRequestHandler):
+    """A bucket with folders Train/clip000000/cartesian/velodyne, ..., and nothing else."""
+
+    count, requests = 300_000, 0
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+    def do_HEAD(self) -> None:
+        self.send_error(404)
+
+    def do_GET(self) -> None:
+        type(self).requests += 1
+        query = {name: value[0] for name, value in parse_qs(urlparse(self.path).query).items()}
+        prefix = query.get("prefix", "")
+        if "list-type" not in query:
+            self.send_error(404)
+            return
+        above = {"": "Train/", "Train/": None}.get(
+            prefix.removeprefix("set/"), f"{prefix}velodyne/"
+        )
+        first = int(query.get("continuation-token", "0"))
+        end = min(first + 1000, self.count)
+        names = [f"set/{above}"] if prefix == "set/" else [above]
+        if above is None:
+            names = [f"{prefix}clip{index:06d}/" for index in range(first, end)]
+        more = above is None and end < self.count
+        body = (
+            f"<ListBucketResult><Name>b</Name><Prefix>{prefix}</Prefix><MaxKeys>1000</MaxKeys>"
+            f"<KeyCount>{len(names)}</KeyCount><IsTruncated>{str(more).lower()}</IsTruncated>"
+            + (f"<NextContinuationToken>{end}</NextContinuationToken>" if more else "")
+            + "".join(f"<CommonPrefixes><Prefix>{n}</Prefix></CommonPrefixes>" for n in names)
+            + "</ListBucketResult>"
+        ).encode()
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+
+@pytest.mark.slow
+def test_three_hundred_thousand_folders_of_a_store_are_dealt_in_seconds(tmp_path):
+    server = ThreadingHTTPServer(("127.0.0.1", 0), ManyFolders)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    code = (
+        "import resource, sys; from carlasc import Run; from carlasc.running import Part\n"
+        "from carlasc.storage import open; from carlasc.storage.shares import Share\n"
+        f"share = Share(open('s3://b/set'), Run(part=Part(7, 1000), sequences_from={str(tmp_path / 'list')!r}))\n"
+        "used = resource.getrusage(resource.RUSAGE_SELF)\n"
+        "print(len(share.own), len(share.others), used.ru_utime + used.ru_stime, used.ru_maxrss)"
+    )
+    address = f"http://127.0.0.1:{server.server_port}"
+    own = {**os.environ, **environment_for(address)}
+    done = []
+    for _ in range(2):
+        ran = subprocess.run([sys.executable, "-c", code], env=own, capture_output=True, text=True)
+        assert ran.returncode == 0, ran.stderr[-2000:]
+        done.append([float(value) for value in ran.stdout.split()])
+        if len(done) == 1:
+            asked = ManyFolders.requests
+    server.shutdown()
+    assert done[0][:2] == done[1][:2] and sum(done[0][:2]) == ManyFolders.count
+    assert all(seconds < 10 and memory < 500_000 for _, _, seconds, memory in done), done
+    assert 300 <= asked <= 320 and ManyFolders.requests - asked <= 10, (asked, done)
