@@ -72,7 +72,7 @@ class Clips:
             StorageError: the output or the scratch cannot be written.
         """
         sink = FolderSink(self.out)
-        todo = [name for name in self.names if sink.target.read(_done(name)) is None]
+        todo = [name for name in self.names if sink.target.read(self._done(name)) is None]
         for name, place in self._fetched(todo):
             if isinstance(place, CarlascError):
                 yield Failure(name, -1, str(place))
@@ -85,8 +85,12 @@ class Clips:
                 yield Failure(name, -1, str(error).replace(str(place), without_credentials(name)))
                 continue
             if not result.failures:
-                sink.target.put(_done(name), to_json({"clip": without_credentials(name)}))
+                sink.target.put(self._done(name), to_json({"clip": without_credentials(name)}))
             yield result
+
+    def _done(self, name: str) -> str:
+        """Return the file that says that a clip is done with these arguments."""
+        return f"{layout.DERIVED}/clips/{combined(name, repr(self.arguments))}.json"
 
     def _convert(self, name: str, place: Path, sink: FolderSink, run: Run) -> Any:
         given, record = {**self.arguments}, layout.record_file("clip")
@@ -208,8 +212,3 @@ def _run_one(clips: Clips) -> list[Any]:
 
 def _fail(clips: Clips, message: str) -> list[Any]:
     return [Failure(clips.names[0], -1, message)]
-
-
-def _done(name: str) -> str:
-    """Return the file that says that a clip is done."""
-    return f"{layout.DERIVED}/clips/{combined(name)}.json"

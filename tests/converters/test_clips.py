@@ -19,7 +19,7 @@ from helpers.servers.http_server import Site, serve
 from helpers.servers.object_store import BUCKET, client_of, environment_for, s3_server
 
 from carlasc import Run
-from carlasc.converting import convert
+from carlasc.converting import LayoutOptions, convert
 from carlasc.errors import ArgumentError
 from carlasc.running import Part
 from carlasc.testing import SimulatedDrive
@@ -71,6 +71,10 @@ def test_clips_of_a_server_are_converted_once_and_what_fails_is_listed(tmp_path,
         assert len(again.failures) == 3 and not again.sequences
         whole_files = {f"bytes=0-{len(data) - 1}" for data in files.values()}
         assert not whole_files & {*site.requests[asked:]}  # nothing that is done is fetched
+        other = LayoutOptions(allow_unknown=True)
+        run = Run(1, sequences_from=listed(tmp_path, *names))
+        again = convert("ncore", site.url, tmp_path / "out", grids=None, layout=other, run=run)
+        assert again.skipped == 6  # of other options: they are looked at again
     assert not [one for one in (tmp_path / "scratch").rglob("*") if one.suffix != ".lock"]
     whole = convert_whole(tmp_path, files)
     assert scans(tmp_path / "out") == whole

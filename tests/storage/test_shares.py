@@ -186,7 +186,9 @@ def test_three_hundred_thousand_folders_of_a_store_are_dealt_in_seconds(tmp_path
     own = {**os.environ, **environment_for(address)}
     done = []
     for _ in range(2):
-        ran = subprocess.run([sys.executable, "-c", code], env=own, capture_output=True, text=True)
+        ran = subprocess.run(
+            [sys.executable, "-c", code], env=own, capture_output=True, text=True, check=False
+        )
         assert ran.returncode == 0, ran.stderr[-2000:]
         done.append([float(value) for value in ran.stdout.split()])
         if len(done) == 1:
