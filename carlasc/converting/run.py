@@ -157,8 +157,8 @@ def convert(
             found="True",
         )
     if run.sequences_from is not None and not isinstance(out, Sink):
-        own = {"source", "out", "run", "scratch"}
-        given = {key: arguments[key] for key in sorted(arguments.keys() - own)}
+        places = {"source", "out", "run", "scratch"}
+        given = {key: arguments[key] for key in sorted(arguments.keys() - places)}
         results = convert_clips(convert, source, out, given, scratch, run)
         return _joined(results, time.perf_counter() - start)
     root = Path(source)
