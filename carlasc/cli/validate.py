@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from carlasc.inspection.heldout_scores import HeldOutScores, RayShares
 
 _SHOWN = 3
+_MANY, _WORST = 100, 10  # of more sequences, the worst are printed
 _SAMPLE = 20  # frames of each grid that are made again with --full
 _COLORS = {"error": "red", "warning": "yellow", "note": "cyan"}
 
@@ -71,7 +73,7 @@ def validate(
     ] = False,
     everything: Annotated[
         bool,
-        typer.Option("--all", help="Print all findings, not only the first three of each kind."),
+        typer.Option("--all", help="Print all findings and sequences, not only the first."),
     ] = False,
     as_json: Json = False,
     holdout: HoldoutFlags,
@@ -141,7 +143,12 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
             show(f"  {finding}")
         if len(findings) > len(shown):
             show(f"  ... and {len(findings) - len(shown)} more (--all prints them)")
-    for report in result.sequences:
+    reports, found = result.sequences, Counter(finding.sequence for finding in result.findings)
+    if len(reports) > _MANY and not everything:
+        frames = sum(report.frames for report in reports)
+        show(f"{len(reports)} sequences, {count(frames, 'frame')}; those with most findings:")
+        reports = tuple(sorted(reports, key=lambda report: -found[report.path])[:_WORST])
+    for report in reports:
         figures = [
             f"{share:.1%} of points in voxels of their class ({grid})"
             for grid, share in report.voxel_share.items()

@@ -335,7 +335,7 @@ class StoredSequence(SequenceInput):
 
     def __init__(self, sequence: Sequence, plan: GridPlan) -> None:
         self.sequence, self.plan = sequence, plan
-        self.path = parent_path(sequence)
+        self.path = layout.place_of(sequence.path)
         self.location, self.metadata = sequence.location, sequence.metadata
 
     def files(self) -> FrameFiles | None:
@@ -562,12 +562,6 @@ def stored_views(sequence: Sequence, frame: int) -> Views:
     return [
         (camera, scan_T_camera(sequence, camera, frame)) for camera in cameras_of(sequence).values()
     ]
-
-
-def parent_path(sequence: Sequence) -> str:
-    """Return the path above `<coordinates>`, where a run writes the sequence again."""
-    head, _, last = sequence.path.rpartition("/")
-    return head if last == sequence.coordinates else sequence.path
 
 
 def without_caches(sequence: Sequence) -> Sequence:

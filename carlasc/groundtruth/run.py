@@ -65,6 +65,7 @@ from carlasc.storage.resuming import (
     check_name,
     check_scan,
 )
+from carlasc.storage.shares import Share, source_in
 from carlasc.storage.transport.remote_tree import check_shared
 from carlasc.storage.transport.trees import is_url
 
@@ -164,16 +165,23 @@ def regrid(
     sink = as_sink(_folder_of(source) if out is None else out, part=run.part)
     for place in (sink.location, str(source)):
         check_shared(place, run)
-    plan = GridPlan(
-        spec, grid, _choose(source) if observe is None else observe, voting, FrameRange.of(frames)
-    )
-    jobs = [
-        _prepare(inputs, sink, plan, compare_inputs, overwrite=overwrite)
-        for inputs in _sequences(source, plan)
-    ]
+    share = None
+    if run.is_share and not isinstance(source, Capture):
+        share = Share(as_source(source), run)
+    places, others = ([""], []) if share is None else (share.own, share.others)
+    if observe is None:
+        observe = _choose(source, share)
+    plan = GridPlan(spec, grid, observe, voting, FrameRange.of(frames))
+    found = list[SequenceInput]()
+    try:
+        found += _sequences(source, plan, places)
+    except MissingDataError:
+        if not others:
+            raise
+    jobs = [_prepare(one, sink, plan, compare_inputs, overwrite=overwrite) for one in found]
 
     with ExitStack() as open_things:
-        pool = open_things.enter_context(one_pool(run))
+        pool = open_things.enter_context(one_pool(run if share is None else share.run))
         for job in jobs:
             _begin(job)
             job.announce()
@@ -184,7 +192,9 @@ def regrid(
     if sink is not out and (work.has_written or not sink.is_finished):
         if run.part.count == 1:
             sink.finish(incomplete=True)  # missing frames could not be made, and are reported
-        elif not any(job.missing() for job in jobs):
+        elif not any(job.missing() for job in jobs) and all(
+            _is_complete(source, plan, sink, place) for place in others
+        ):
             sink.finish()
 
     grids = tuple(sink.place(f"{job.path}/{grid}") for job in jobs)
@@ -195,8 +205,21 @@ def regrid(
     return RegridResult(grids, spec, made, work.skipped, tuple(failures), took, notes, uses)
 
 
-def _choose(source: AnyPath | Source | Capture) -> Observe:
-    """Return the default of `observe`: a capture if there is one, otherwise scans.
+def _is_complete(
+    source: AnyPath | Source | Capture, plan: GridPlan, sink: Sink, place: str
+) -> bool:
+    """Whether another part has made the sequences of a folder."""
+    try:
+        found = _sequences(source, plan, [place])
+    except MissingDataError:
+        return True
+    paths = [f"{one.path}/{plan.spec.coordinates}".lstrip("/") for one in found]
+    return all(sink.sequence(path).is_complete() for path in paths)
+
+
+def _choose(source: AnyPath | Source | Capture, share: Share | None) -> Observe:
+    """Return the default of `observe`: a capture if there is one, otherwise scans. Parts look at
+    their own sequences, and at the first one.
 
     Raises:
         MissingDataError: there is neither.
@@ -205,12 +228,12 @@ def _choose(source: AnyPath | Source | Capture) -> Observe:
         return FromCapture()
     if not isinstance(source, Source):
         try:
-            find_captures(source)
+            find_captures(source, ("",) if share is None else [*share.own, share.first])
         except MissingDataError:
             pass
         else:
             return FromCapture()
-    opened = as_source(source)
+    opened = as_source(source) if share is None else share
     try:
         opened.sequences()
     except MissingDataError as error:
@@ -224,22 +247,27 @@ def _choose(source: AnyPath | Source | Capture) -> Observe:
     return FromScans()
 
 
-def _sequences(source: AnyPath | Source | Capture, plan: GridPlan) -> list[SequenceInput]:
-    """Return the sequences of a source.
+def _sequences(
+    source: AnyPath | Source | Capture, plan: GridPlan, places: Series[str]
+) -> list[SequenceInput]:
+    """Return the sequences of some places of a source: see `Source.places`.
 
     Raises:
         ArgumentError: the source does not fit `observe` or the plan.
         MissingDataError: there is no sequence.
     """
     if isinstance(plan.observe, FromCapture):
-        return capture_sequences(source, plan)
+        return capture_sequences(source, plan, places)
     if isinstance(source, Capture):
         raise ArgumentError(
             "observe", expected="FromCapture() with a capture", found=repr(plan.observe)
         )
+    opened = as_source(source)
+    if [*places] != [""]:
+        opened = source_in(opened, places)
     if isinstance(plan.observe, FromScans):
-        return scan_sequences(source, plan, plan.observe)
-    return resampled_sequences(source, plan, plan.observe)
+        return scan_sequences(opened, plan, plan.observe)
+    return resampled_sequences(opened, plan, plan.observe)
 
 
 def _folder_of(source: AnyPath | Source | Capture) -> str | Path:

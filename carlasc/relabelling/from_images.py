@@ -61,6 +61,7 @@ from carlasc.storage.class_files import read_classes
 from carlasc.storage.derived_copies import sequences_with_scans
 from carlasc.storage.files import AnyPath
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
+from carlasc.storage.shares import Share
 
 _SUFFIXES = (".png", ".npy")
 _FIELD = "image_labels"  # of the layout
@@ -138,13 +139,13 @@ def label_images(
     root = None if pixels is None else Path(pixels)
     by = by if by is not None else "images" if root is None else root.resolve().name
     table = None if classes is None else read_classes(classes)[0]
-    source = as_source(source)
-    given = sequences_with_scans(source)
+    share = Share(as_source(source), run)
+    given = sequences_with_scans(share)
     shown = {path: PixelClasses.find(one, root) for path, one in given.items()}
     inputs = scan_sequences_of(given, observe)
     files = (path for one in shown.values() for path in one.paths())
     settings = {"observe": repr(observe), "pixels": digest_of_files(files), "by": by}
-    copy = begin_predicted(source, out, settings, table, overwrite, run)
+    copy = begin_predicted(share, out, settings, table, overwrite, run)
 
     def find(
         path: str, writer: SequenceWriter | None, pool: Run, step: StepCounter
@@ -153,7 +154,7 @@ def label_images(
         reader = PredictionReader.of(table, given[path], logits=False)
         return _ShownSequence(inputs[path], shown[path], reader, by)
 
-    labelled, copied = write_in_stages(copy, given, find, run, scans=0, made=PREDICTED_FIELDS)
+    labelled, copied = write_in_stages(copy, given, find, share.run, scans=0, made=PREDICTED_FIELDS)
     return LabelResult.of(copied, began, by, labelled.values())
 
 

@@ -25,7 +25,7 @@ from carlasc.core.arrays import AnyArray, IntArray
 from carlasc.errors import CarlascError, CompleteError, ConflictError, MissingDataError
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
-from carlasc.storage.copying import UnpackResult, refuse_overlap, unpack
+from carlasc.storage.copying import UnpackResult, refuse_overlap, unpack, write_files
 from carlasc.storage.files import (
     AnyPath,
     has_content,
@@ -41,6 +41,7 @@ from carlasc.storage.inputs import sequence_states
 from carlasc.storage.layout import Metadata
 from carlasc.storage.packed.output import remove
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
+from carlasc.storage.shares import Share
 from carlasc.storage.transport.trees import is_url
 from carlasc.storage.views import ChosenSequences, SequenceView
 
@@ -146,13 +147,13 @@ class DerivedSequence(SequenceView):
 
 
 def sequences_with_scans(source: Source) -> dict[str, Sequence]:
-    """Return the sequences of a source that have points, by path.
+    """Return the sequences of a source that have points, by path; a part may have none.
 
     Raises:
         MissingDataError: no sequence has points.
     """
     found = {path: one for path, one in source.sequences().items() if len(one.frames("points"))}
-    if not found:
+    if not (found or (isinstance(source, Share) and source.others)):
         raise MissingDataError(source.location, expected="sequences with points", found="none")
     return found
 
@@ -201,8 +202,9 @@ class DerivedCopy:
         run.part.refuse(overwrite)
         refuse_overlap(out, source)
         self.source, self.out, self.overwrite = source, out, overwrite
+        self.is_part = run.part.count > 1
         self.mark: Path | None = None
-        if not is_url(out) and run.part.count == 1:
+        if not (is_url(out) or self.is_part):
             inputs = sequence_states(source)
             settings = {"source": source.location, "kind": kind, "inputs": inputs, **made_from}
             if not overwrite and has_content(record := Path(out) / _RECORD):
@@ -224,7 +226,7 @@ class DerivedCopy:
 
         Args:
             sequences: the sequences by path.
-            run: how the work is distributed. Progress counts files.
+            run: how the work on these is distributed. Progress counts files.
 
         Raises:
             StorageError: the files cannot be written.
@@ -236,7 +238,11 @@ class DerivedCopy:
         chosen = ChosenSequences(self.source.location, sequences)
         aside = self.overwrite and self.mark is None
         with _naming_replaced(Path(self.out)):
-            copied = unpack(chosen, self.out, overwrite=aside, run=run)
+            if self.is_part:
+                copied = UnpackResult(str(self.out) if is_url(self.out) else Path(self.out))
+                write_files(sequences, FolderSink(self.out), copied, run, again=False)
+            else:
+                copied = unpack(chosen, self.out, overwrite=aside, run=run)
         if self.mark is not None:
             for path in sequences:
                 shutil.rmtree(Path(self.out) / path / layout.DERIVED, ignore_errors=True)

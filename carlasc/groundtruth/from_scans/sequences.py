@@ -34,7 +34,6 @@ from carlasc.groundtruth.inputs import (
     SequenceInput,
     StoredSequence,
     choose_frames,
-    parent_path,
     scan_fields,
     stored_views,
 )
@@ -413,7 +412,7 @@ def scan_sequences(
     """
     sequences: dict[str, Sequence] = {}
     for sequence in as_source(source).sequences().values():
-        parent = parent_path(sequence)
+        parent = layout.place_of(sequence.path)
         # scans may exist beside the grids of both coordinates: take the folder with more
         other = sequences.get(parent)
         if other is None or len(sequence.frames("points")) > len(other.frames("points")):

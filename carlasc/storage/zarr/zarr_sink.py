@@ -136,6 +136,13 @@ class ZarrWriter(SequenceWriter):
             self._start()
             self.target.put(f"{self.group}/{EXPECTED}", format_expected(merged))
 
+    def is_complete(self) -> bool:
+        """Whether the announced frames are written."""
+        expected = read_expected(self.target, self.group)
+        return bool(expected) and all(
+            self.has(name, frame) for name, frames in expected.items() for frame in frames
+        )
+
     def has(self, field: str, frame: int) -> bool:
         """Whether this or another process has written the frame."""
         layout.field_named(field)
