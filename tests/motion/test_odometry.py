@@ -100,6 +100,7 @@ def step_errors(estimated, true):
     return np.linalg.norm(steps[0][:, :3, 3] - steps[1][:, :3, 3], axis=1)
 
 
+@pytest.mark.slow
 def test_a_drive_may_start_at_any_speed(bend):
     _, scans, true = bend
     estimated = estimate_poses([scan.deskewed[:, :3] for scan in scans], max_range_m=50.0)
@@ -118,6 +119,7 @@ def test_the_sensor_may_be_at_any_height(height_m):
     assert step_errors(estimated, true).max() < 0.06
 
 
+@pytest.mark.slow
 def test_poses_of_rolling_scans_are_those_at_the_times_of_the_frames(bend):
     drive, scans, true = bend
     points, seconds = [scan.points[:, :3] for scan in scans], [scan.seconds for scan in scans]

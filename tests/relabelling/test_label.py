@@ -116,6 +116,7 @@ def test_carlasc_json_keeps_what_it_said_and_names_who_predicted(data, predictio
     assert {one.metadata.predicted for one in made.values()} == {"predicted by SPVCNN, 2 epochs"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", [".zarr", ".h5", ".parquet"])
 def test_probabilities_go_through_every_store_and_packed_sources_are_unpacked(
     data, predictions, tmp_path, ending

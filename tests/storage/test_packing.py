@@ -69,6 +69,7 @@ def test_a_zip_is_packed_in_place(data: Path, tmp_path: Path) -> None:
     assert round_trip(archive, tmp_path / "x.zarr") == files_of(data)
 
 
+@pytest.mark.slow
 def test_a_store_is_packed_again_as_another_kind(data: Path, tmp_path: Path) -> None:
     pack(data, tmp_path / "a.h5")
     pack(tmp_path / "a.h5", tmp_path / "b.parquet")
@@ -185,6 +186,7 @@ def test_counts_of_any_size_come_back(tmp_path: Path, kind: str, most: float) ->
     assert round_trip(tmp_path / "data", tmp_path / f"x.{kind}") == files_of(tmp_path / "data")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("largest", [255, 256, 65_536, 2**32 - 1])
 def test_labels_of_any_size_come_back(tmp_path: Path, kind: str, largest: int) -> None:
@@ -266,6 +268,7 @@ def test_the_result_counts_bytes_per_field_and_lists_what_is_left_out(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_existing_store_is_replaced_only_with_overwrite(
     data: Path, tmp_path: Path, kind: str
@@ -292,6 +295,7 @@ def test_an_existing_folder_is_unpacked_into_only_with_overwrite(
     assert files_of(tmp_path / "files") == files_of(data / "Val") | {"mine.txt": b"mine"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("out", ["x.zarr", "Train/x.zarr", ".", ".."])
 def test_an_output_inside_or_around_the_source_is_refused(tmp_path: Path, out: str) -> None:
     data = write_dataset(tmp_path / "data")
@@ -333,6 +337,7 @@ def test_an_output_that_cannot_be_written_is_one_clear_error(
         pack(data / "Val", tmp_path / "file" / f"x.{kind}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ["../evil", "/tmp/evil", "Train/../../evil"])
 def test_a_store_whose_names_lead_elsewhere_is_not_unpacked(
     data: Path, tmp_path: Path, path: str
