@@ -42,11 +42,14 @@ class MapExtras:
             OUT_actors, and their poses to actors.json.
         mesh: file of the surface of the occupied cells, with classes as colours: .ply or .glb.
         distance: with `grid`: .npz file of the distance of each voxel from the surface.
+        trajectory: file of the pose of the sensor in the map at each scan, in the format of TUM:
+            seconds since the first frame, position, quaternion x, y, z, w.
     """
 
     actors: bool = False
     mesh: AnyPath | None = None
     distance: AnyPath | None = None
+    trajectory: AnyPath | None = None
 
     def __post_init__(self) -> None:
         check_types(MapExtras, vars(self))
@@ -161,7 +164,8 @@ def map(
         )
     if run.part.count > 1:
         raise ArgumentError("part", expected="none, as a map is one file", found=str(run.part))
-    files = MapFiles.of(out, extras.mesh, extras.distance, extras.actors, grid)
+    extra = {"mesh": extras.mesh, "distance": extras.distance, "trajectory": extras.trajectory}
+    files = MapFiles.of({"out": out, **extra}, extras.actors, grid)
     wanted, keep, options = FrameRange.of(frames), recording.keep, recording.options
     root, reader = None, None
     if (
