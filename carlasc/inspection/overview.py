@@ -19,7 +19,6 @@ from carlasc.core.arrays import IntArray
 from carlasc.core.notebook import data_frame
 from carlasc.errors import CarlascError, MissingDataError, check_types, without_credentials
 from carlasc.inspection.staleness import changed_inputs
-from carlasc.metrics.results import Interval, interval_of
 from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath
@@ -30,6 +29,8 @@ from carlasc.storage.shares import read_list, source_in
 
 if TYPE_CHECKING:
     import pandas
+
+    from carlasc.metrics.results import Interval
 
 _SIZED = 3  # the size of a field is estimated from this number of files
 
@@ -149,6 +150,8 @@ class Overview:
         """Return the sum of "frames" or "bytes" over all sequences, with its interval if only some
         were looked at.
         """
+        from carlasc.metrics.results import interval_of  # compiles loops, for scores
+
         values = np.array([getattr(one, name) or 0 for one in self.sequences], np.float64)
         number, degrees = sum(self.places.values()) or len(values), len(values) - 1
         missed = 1 - len(values) / number

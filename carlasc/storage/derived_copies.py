@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -207,10 +207,14 @@ class DerivedCopy:
         if not (is_url(out) or self.is_part):
             inputs = sequence_states(source)
             settings = {"source": source.location, "kind": kind, "inputs": inputs, **made_from}
-            if not overwrite and has_content(record := Path(out) / _RECORD):
-                check_complete(out, record.read_bytes() == to_json(settings))
+            self.mark = _mark_of(unfinished(Path(out)))
+            if not overwrite and Path(out).exists():
+                if self._was_finished(to_json(settings)):
+                    self._finish(FolderSource(out).sequences())
+                if has_content(record := Path(out) / _RECORD):
+                    check_complete(out, record.read_bytes() == to_json(settings))
             _check_replaceable(Path(out), kind, is_kind, overwrite=overwrite)
-            self.mark = _mark(unfinished(Path(out)), settings, overwrite=overwrite)
+            _begin(self.mark, unfinished(Path(out)), to_json(settings), overwrite=overwrite)
             if Path(out).exists():  # an older copy, which is removed when the new one is complete
                 remove(replaced(Path(out)))
                 Path(out).rename(replaced(Path(out)))
@@ -243,19 +247,31 @@ class DerivedCopy:
                 write_files(sequences, FolderSink(self.out), copied, run, again=False)
             else:
                 copied = unpack(chosen, self.out, overwrite=aside, run=run)
-        if self.mark is not None:
-            for path in sequences:
-                shutil.rmtree(Path(self.out) / path / layout.DERIVED, ignore_errors=True)
-            write_atomic(Path(self.out) / _RECORD, self.mark.read_bytes())
-            self.mark.unlink(missing_ok=True)
-            if self.overwrite:
-                remove(replaced(Path(self.out)))
+        self._finish(sequences)
         return CopyResult(
             **vars(copied)
             | {"kept": copied.kept - linked, "elapsed_s": time.perf_counter() - began},
             linked=linked,
             left_out=sorted({name for one in sequences.values() for name in one.left_out}),
         )
+
+    def _was_finished(self, settings: bytes) -> bool:
+        """Whether a killed run had these settings, and all files of the copy have their place."""
+        mark = self.mark
+        if mark is None or unfinished(Path(self.out)).exists() or not has_content(mark):
+            return False
+        return mark.read_bytes() == settings
+
+    def _finish(self, paths: Iterable[str]) -> None:
+        """Write the record of the copy, and remove what was kept until it is complete."""
+        if self.mark is None:
+            return
+        for path in paths:
+            shutil.rmtree(Path(self.out) / path / layout.DERIVED, ignore_errors=True)
+        write_atomic(Path(self.out) / _RECORD, self.mark.read_bytes())
+        self.mark.unlink(missing_ok=True)
+        if self.overwrite:
+            remove(replaced(Path(self.out)))
 
 
 @contextmanager
@@ -301,14 +317,18 @@ def _check_replaceable(
         raise ConflictError(out, expected=expected, found="something else", advice=advice)
 
 
-def _mark(folder: Path, settings: Mapping[str, Any], *, overwrite: bool) -> Path:
-    """Write input and options of an unfinished copy into a file beside it, and return that file.
+def _mark_of(folder: Path) -> Path:
+    """Return the file beside an unfinished copy that records its input and options."""
+    return folder.with_name(f"{folder.name}.json")
+
+
+def _begin(mark: Path, folder: Path, data: bytes, *, overwrite: bool) -> None:
+    """Write input and options of an unfinished copy into its mark.
 
     Raises:
         ConflictError: the folder holds the files of an interrupted run with another input or other
             options.
     """
-    mark, data = folder.with_name(f"{folder.name}.json"), to_json(dict(settings))
     before = mark.read_bytes() if mark.is_file() else None
     if folder.exists() and before != data:
         if before is None or not overwrite:
@@ -318,7 +338,6 @@ def _mark(folder: Path, settings: Mapping[str, Any], *, overwrite: bool) -> Path
             )
         shutil.rmtree(folder)
     write_atomic(mark, data)
-    return mark
 
 
 def _link_files(sequence: DerivedSequence, folder: Path) -> int:
