@@ -43,7 +43,8 @@ class CarlascError(Exception):
     EXPECTED, found FOUND: ADVICE`.
 
     Attributes:
-        where: place of the error: a file, a URL, a field, or the name of an argument.
+        where: place of the error: a file, a URL, a field, or the name of an argument; what has a
+            location, such as a source, is named by it.
         problem: what went wrong, if "expected ..., found ..." is not sufficient.
         expected: the expected value or state.
         found: the actual value or state.
@@ -60,7 +61,7 @@ class CarlascError(Exception):
         found: str = "",
         advice: str = "",
     ) -> None:
-        shown = without_credentials(str(where))
+        shown = without_credentials(str(getattr(where, "location", where)))
         super().__init__(
             shown
             # the only positional argument, so that errors can be pickled: other attributes are in

@@ -31,7 +31,7 @@ from carlasc.core.arrays import (
 from carlasc.core.cameras import CameraModel
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points
-from carlasc.errors import FormatError, MissingDataError, check_types
+from carlasc.errors import FormatError, MissingDataError, check_types, reading
 from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
 from carlasc.groundtruth.options import FromScans, Voting
@@ -223,7 +223,9 @@ class PixelClasses:
         if path is None:
             return None
         if path.suffix == ".png":
-            return decode_image(path.read_bytes(), str(path), camera, color=False)
+            with reading(path, "a file that can be read"):
+                data = path.read_bytes()
+            return decode_image(data, str(path), camera, color=False)
         array = read_npy(path, ArrayFormat(NUMBERS, None))
         size, is_float = (camera.height, camera.width), array.dtype.kind == "f"
         if array.ndim != 2 + is_float or array.shape[:2] != size:

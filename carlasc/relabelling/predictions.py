@@ -26,7 +26,7 @@ from carlasc.core.arrays import (
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.tables import remaps_between, to_table
-from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_types
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_types, reading
 from carlasc.relabelling.copies import (
     PREDICTED_FIELDS,
     LabelResult,
@@ -345,7 +345,8 @@ def load(path: Path) -> tuple[AnyArray | None, AnyArray | None]:
                 found=found,
             )
         return (None, array) if is_float else (array, None)
-    data = path.read_bytes()
+    with reading(path, "a file that can be read"):
+        data = path.read_bytes()
     if len(data) % 4:
         raise FormatError(
             path, expected="a multiple of 4 bytes (uint32 per point)", found=str(len(data))
