@@ -70,7 +70,7 @@ def audit(
     else:
         _print(result, everything=everything)
     for failure in result.failures:
-        echo(f"{failure.where}: frame {failure.frame}: {failure.message}", err=True)
+        echo(f"carlasc: {failure.where}: frame {failure.frame}: {failure.message}", err=True)
     if not result.ok:
         raise typer.Exit(FAILED)
 

@@ -77,9 +77,11 @@ class _Stretch:
         """The name of the sums, which differs for other grids, other scans or another window."""
         one, content = self.matched, sha256()
         for number, _ in self.frames:
-            with suppress(CarlascError, OSError):  # which is reported when the frame is counted
-                for array in one.read(number):
-                    content.update(b"" if array is None else array.tobytes())
+            for _ in range(2):  # a temporary error makes no other name
+                with suppress(CarlascError, OSError):  # it is reported when the frame is counted
+                    arrays = [b"" if part is None else part.tobytes() for part in one.read(number)]
+                    content.update(b"".join(arrays))
+                    break
         about = (one.path, one.spec, self.frames, self.window, self.scans)
         return sha256(repr((_VERSION, *about, content.digest())).encode()).hexdigest()
 

@@ -5,6 +5,7 @@ number of frames.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
@@ -193,10 +194,10 @@ class FrameCounter:
         """Return the scan of another frame; None if it does not exist or cannot be read (its own
         frame reports the error).
         """
-        try:
-            return self._scan(frame) if frame in self.matched.seconds else None
-        except (CarlascError, OSError):
-            return None
+        for _ in range(2):  # after a temporary error, its own frame would report nothing
+            with suppress(CarlascError, OSError):
+                return self._scan(frame) if frame in self.matched.seconds else None
+        return None
 
     def _grid_T_world(self, frame: int) -> FloatArray | None:
         pose = self.matched.poses.get(frame)
