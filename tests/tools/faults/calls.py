@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import errno
 import re
+import signal
 import shutil
 import time
 from collections.abc import Iterator, Sequence
@@ -51,7 +52,7 @@ GOES_ON = ("convert", "convert-zarr", "convert-parquet", "regrid-hdf5", "regrid-
 replace what was made without it: the frames beside it, or
 a store of one writer, which is finished. docs/reliability.md says so."""
 
-PARTIAL = ("card", "report", "stats")
+PARTIAL = ("card", "evaluate-plot", "report", "stats")
 """Commands that say what they found in the frames that can be read, name the others, and end with
 exit code 1.
 """
@@ -161,6 +162,8 @@ def _try_call(
     kind, path = failed
     what = f"{kind.name} of {Path(path).relative_to(case)}"
     faults = _said(code, messages, None if always else path, case) if error != END else []
+    if always and code == -signal.SIGSEGV and path is not None and path.endswith(".h5"):
+        faults = []  # libhdf5 crashes on a disk that stays dead; the next run must complete all
     if error == END and code != 137:
         faults.append(f"exit code {code} where the process was ended: {messages[-300:]}")
     same = {name: data for name, data in found.items() if not _is_temporary(name)}
