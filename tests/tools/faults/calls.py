@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import errno
 import re
-import signal
 import shutil
+import signal
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
