@@ -20,7 +20,9 @@ from functools import cache
 from itertools import groupby
 from numbers import Integral, Real
 from types import FrameType, ModuleType, UnionType
-from typing import Any, Self, Union, get_args, get_origin, get_type_hints
+from typing import Any, Self, TypeVar, Union, get_args, get_origin, get_type_hints
+
+T = TypeVar("T")
 
 _USER = re.compile(r"(?<=://)[^/\s@'\"]+@")  # user:password
 # Characters that control a terminal or change the order of a line: control characters (ESC starts
@@ -148,6 +150,16 @@ def reading(where: object, expected: str, advice: str = "") -> Iterator[None]:
         raise FormatError(
             where, expected=expected, found=f"something else ({describe(error)})", advice=advice
         ) from error
+
+
+def tried_twice(read: Callable[[], T]) -> T | None:
+    """Return what a call reads; None if it fails twice. A temporary error, such as one of a network
+    file system, is not taken for missing data.
+    """
+    for _ in range(2):
+        with suppress(CarlascError, OSError):
+            return read()
+    return None
 
 
 @contextmanager

@@ -24,7 +24,7 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray
 from carlasc.core.choices import CompareInputs
-from carlasc.errors import CarlascError, count, first_names, first_runs
+from carlasc.errors import CarlascError, count, first_names, first_runs, tried_twice
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
@@ -169,14 +169,12 @@ def content_digests(
 
 def _digests(files: FrameFiles, frames: list[int]) -> list[str]:
     """Return the digests of some frames, in a worker."""
-    digests = []
-    for frame in frames:
-        digests.append(_UNREADABLE)
-        for _ in range(2):  # a second try, because a temporary error is not a change
-            with suppress(CarlascError, OSError):  # it is reported when the frame is used
-                digests[-1] = combined(*files.contents(frame))
-                break
-    return digests
+    # an error is reported when the frame is used
+    return [tried_twice(partial(_digest, files, frame)) or _UNREADABLE for frame in frames]
+
+
+def _digest(files: FrameFiles, frame: int) -> str:
+    return combined(*files.contents(frame))
 
 
 def _states(files: FrameFiles, frames: list[int]) -> dict[int, str]:

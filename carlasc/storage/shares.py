@@ -69,7 +69,8 @@ def read_list(run: Run, places: Callable[[], list[str]]) -> list[str]:
     target = target_of(folder or ".")
     if (data := target.read(name)) is None:
         lines = "".join(f"{place or '.'}\n" for place in places())
-        target.put(name, lines.encode(errors="surrogateescape"), create=True)
+        if lines:  # `finish` finds none: it would leave an empty list for the parts
+            target.put(name, lines.encode(errors="surrogateescape"), create=True)
         data = target.read(name) or b""
     named = data.decode(errors="surrogateescape").splitlines()
     found = [line.strip().rstrip("/") for line in named if line.strip()]

@@ -9,9 +9,9 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from collections.abc import Sequence as Series
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from hashlib import sha256
 from itertools import groupby
 from pathlib import Path
@@ -20,7 +20,14 @@ import numpy as np
 
 from carlasc.core.arrays import Uint8Array
 from carlasc.core.frames import Frames
-from carlasc.errors import ArgumentError, CarlascError, MissingDataError, check_types, reading
+from carlasc.errors import (
+    ArgumentError,
+    CarlascError,
+    MissingDataError,
+    check_types,
+    reading,
+    tried_twice,
+)
 from carlasc.groundtruth import FromScans
 from carlasc.groundtruth.from_scans.feed import ScanFeed, WithoutScans
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
@@ -77,11 +84,9 @@ class _Stretch:
         """The name of the sums, which differs for other grids, other scans or another window."""
         one, content = self.matched, sha256()
         for number, _ in self.frames:
-            for _ in range(2):  # a temporary error makes no other name
-                with suppress(CarlascError, OSError):  # it is reported when the frame is counted
-                    arrays = [b"" if part is None else part.tobytes() for part in one.read(number)]
-                    content.update(b"".join(arrays))
-                    break
+            # an error is reported when the frame is counted
+            for part in tried_twice(partial(one.read, number)) or ():
+                content.update(b"" if part is None else part.tobytes())
         about = (one.path, one.spec, self.frames, self.window, self.scans)
         return sha256(repr((_VERSION, *about, content.digest())).encode()).hexdigest()
 

@@ -5,9 +5,8 @@ number of frames.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
@@ -26,7 +25,7 @@ from carlasc.core.compiling import cached
 from carlasc.core.geometry import invert, thin, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan
-from carlasc.errors import CarlascError
+from carlasc.errors import tried_twice
 from carlasc.inspection.auditing.geometry import families
 from carlasc.inspection.auditing.matching import MatchedGrids
 from carlasc.inspection.auditing.verdicts import Sums, add
@@ -194,10 +193,7 @@ class FrameCounter:
         """Return the scan of another frame; None if it does not exist or cannot be read (its own
         frame reports the error).
         """
-        for _ in range(2):  # after a temporary error, its own frame would report nothing
-            with suppress(CarlascError, OSError):
-                return self._scan(frame) if frame in self.matched.seconds else None
-        return None
+        return tried_twice(partial(self._scan, frame)) if frame in self.matched.seconds else None
 
     def _grid_T_world(self, frame: int) -> FloatArray | None:
         pose = self.matched.poses.get(frame)
