@@ -6,14 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from carlasc.cli.common import Json, console, line, place_argument, print_json, show
+from carlasc.cli.common import MANY, WORST, Json, console, line, place_argument, print_json, show
 from carlasc.cli.library import Given, Library
 from carlasc.errors import count
 
 if TYPE_CHECKING:
     from carlasc.inspection.overview import GridOverview, Overview, SequenceOverview
-
-_SAMPLE, _WORST = 100, 10
 
 
 def info(
@@ -33,7 +31,7 @@ def info(
     """List the contents of a data set: splits, sequences, frames, fields, grids and how they were
     made. No frame is read. Of more than 100 sequences, some are looked at.
     """
-    given = {} if everything else {"sample": _SAMPLE, **options.values}
+    given = {} if everything else {"sample": MANY, **options.values}
     overview = options.make(source, **given)
     if as_json:
         print_json(overview.to_dict())
@@ -75,7 +73,7 @@ def _print(overview: Overview) -> None:
         )
         print_table(header, [_row(sequence) for sequence in overview.sequences], turn=False)
     bad = [sequence for sequence in overview.sequences if sequence.problem]
-    for sequence in bad[:_WORST] if overview.places else bad:
+    for sequence in bad[:WORST] if overview.places else bad:
         show(f"{sequence.path or sequence.name}: {sequence.problem}")
     if kinds := _kinds_of_grids(overview):
         header = (

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from carlasc.cli.common import (
+    MANY,
+    WORST,
     Json,
     SourceArgument,
     echo,
@@ -24,7 +26,6 @@ if TYPE_CHECKING:
     from carlasc.inspection.reports import ReportResult
 
 _SHOWN = 12
-_MANY, _WORST = 100, 10  # of more grids, the worst are printed
 
 
 def report(
@@ -69,12 +70,12 @@ def _print(result: ReportResult, *, everything: bool) -> None:
     from carlasc.inspection.report_page import describe
 
     shown = [*result.reports.items()]
-    if len(shown) > _MANY and not everything:
+    if len(shown) > MANY and not everything:
         frames = sum(len(one.frames) for _, one in shown)
         known = sum(one.coverage.known for _, one in shown)
         share = known / max(sum(one.coverage.voxels for _, one in shown), 1)
         show(f"{len(shown)} grids, {frames:,} frames, {share:.1%} known; those with least known:")
-        shown = sorted(shown, key=lambda row: row[1].coverage.known_share)[:_WORST]
+        shown = sorted(shown, key=lambda row: row[1].coverage.known_share)[:WORST]
     for name, one in shown:
         show(name, "bold")
         rows = describe(one)

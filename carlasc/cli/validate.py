@@ -11,6 +11,8 @@ import typer
 import carlasc
 from carlasc.cli.common import (
     FAILED,
+    MANY,
+    WORST,
     Json,
     SourceArgument,
     print_json,
@@ -28,7 +30,6 @@ if TYPE_CHECKING:
     from carlasc.inspection.heldout_scores import HeldOutScores, RayShares
 
 _SHOWN = 3
-_MANY, _WORST = 100, 10  # of more sequences, the worst are printed
 _SAMPLE = 20  # frames of each grid that are made again with --full
 _COLORS = {"error": "red", "warning": "yellow", "note": "cyan"}
 
@@ -144,10 +145,10 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
         if len(findings) > len(shown):
             show(f"  ... and {len(findings) - len(shown)} more (--all prints them)")
     reports, found = result.sequences, Counter(finding.sequence for finding in result.findings)
-    if len(reports) > _MANY and not everything:
+    if len(reports) > MANY and not everything:
         frames = sum(report.frames for report in reports)
         show(f"{len(reports)} sequences, {count(frames, 'frame')}; those with most findings:")
-        reports = tuple(sorted(reports, key=lambda report: -found[report.path])[:_WORST])
+        reports = tuple(sorted(reports, key=lambda report: -found[report.path])[:WORST])
     for report in reports:
         figures = [
             f"{share:.1%} of points in voxels of their class ({grid})"
