@@ -170,7 +170,8 @@ def content_digests(
 def _digests(files: FrameFiles, frames: list[int]) -> list[str]:
     """Return the digests of some frames, in a worker."""
     # an error is reported when the frame is used
-    return [tried_twice(partial(_digest, files, frame)) or _UNREADABLE for frame in frames]
+    found = list(map(tried_twice, [partial(_digest, files, frame) for frame in frames]))
+    return [digest or _UNREADABLE for digest in found]
 
 
 def _digest(files: FrameFiles, frame: int) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from helpers.datasets.sequences import files_of, grid, params, write_dataset
 from helpers.errors import raises
+from helpers.processes.peak import PRINT_PEAK
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
@@ -418,8 +419,10 @@ def test_a_killed_unpack_continues_file_by_file(data: Path, tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_the_memory_does_not_grow_with_the_sequence(tmp_path: Path) -> None:
-    script = "import resource, sys; from carlasc.storage.packing import pack; pack(sys.argv[1], sys.argv[2]);"
-    script += "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+    script = (
+        "import sys; from carlasc.storage.packing import pack; pack(sys.argv[1], sys.argv[2])\n"
+    )
+    script += PRINT_PEAK
     points = np.zeros((100_000, 4), np.float32)
     points[:, :3] = np.random.default_rng(0).normal(size=(100_000, 1))
     peaks = []
