@@ -119,11 +119,10 @@ def convert_whole(folder: Path, files: dict[str, bytes]) -> dict[str, bytes]:
 
 def sizes(folder: Path) -> int:
     total = 0
-    for path in folder.rglob("*"):
-        try:
-            total += path.stat().st_size if path.is_file() else 0
-        except FileNotFoundError:
-            continue
+    for place, _, names in os.walk(folder):  # passes over folders that are being deleted
+        for name in names:
+            with contextlib.suppress(FileNotFoundError):
+                total += Path(place, name).stat().st_size
     return total
 
 
