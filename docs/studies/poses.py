@@ -57,7 +57,7 @@ ROWS = {
 }
 SCANS = {  # channels, every which scan is used, and whether scans have labels
     "32 channels": (32, 1, True),
-    "32 channels, no labels": (32, 1, False),
+    "32 channels, unlabelled": (32, 1, False),
     "16 channels": (16, 1, True),
     "64 channels": (64, 1, True),
     "32 channels at 2 Hz": (32, 5, True),

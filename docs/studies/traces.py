@@ -25,7 +25,7 @@ from carlasc.viewing import ClassColors, Panel, draw_panels, grid_drawing
 KIND, SEED, CHANNELS, GRID = "street", 261, 64, "0.2 m"
 SHOWN = {
     "tube": "SemanticKITTI's rule (tube)",
-    "align, evidence": "carlasc, which is not told what moves",
+    "align, free space": "carlasc, which is not told what moves",
 }
 
 

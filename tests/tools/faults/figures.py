@@ -157,9 +157,9 @@ def line(rows: dict[str, dict[str, Any]]) -> str:
     found = sum(len(row["found"]) for row in rows.values())
     result = f"{found} faults found" if found else "no torn file, no lost frame"
     kills = rows.get("kills", {}).get("tried", 0)
-    # None of n independent tries failed: with a confidence of 95 %, fewer than 3 / n of all do.
+    # None of n independent tries failed: with a confidence of 95%, fewer than 3 / n of all do.
     bound = (
-        f" (of kills, at most {3 / kills:.1%} can do harm, with a confidence of 95 %)"
+        f" (of kills, at most {3 / kills:.1%} can do harm, with a confidence of 95%)"
         if kills and not found
         else ""
     )

@@ -58,7 +58,7 @@ CONSTANTS: dict[str, dict[str, str]] = {
         "10 frames per second": "film-rate",
         "0.1 s": "frame-period",
     },
-    "docs/design.md": {"5 %": "room-growth"},
+    "docs/design.md": {"5%": "room-growth"},
     "docs/ground-truth.md": {
         "5 s": "horizon",
         "0.5 s": "smooth-boxes",

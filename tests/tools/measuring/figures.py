@@ -43,7 +43,7 @@ class Figure:
             text = _number(self.value)
         else:
             text = f"{_number(self.value)} to {_number(self.high)}"
-        return f"{text} {self.unit}".strip()
+        return f"{text}%" if self.unit == "%" else f"{text} {self.unit}".strip()
 
 
 def _number(value: float) -> str:
