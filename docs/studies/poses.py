@@ -183,10 +183,10 @@ def figures(counts: NDArray[np.int64]) -> NDArray[np.float64]:
 
 def table(tasks: Sequence[Task], grid: str) -> str:
     """Return the means over drives, as a table, with the smallest share of a single drive that is
-    won back.
+    recovered.
     """
     lines = [
-        f"| poses | refined | {' | '.join(FIGURES)} | won back |",
+        f"| poses | refined | {' | '.join(FIGURES)} | recovered |",
         "|---" * (len(FIGURES) + 3) + "|",
     ]
     exact = np.zeros(0)
