@@ -12,6 +12,7 @@ from typing import Any
 
 from faults import figures as faults
 
+from measuring import cells
 from measuring.facts import CONSTANTS, EXCEPTIONS, FACTS
 from measuring.places import fill, keys, sections, typed_by_hand
 
@@ -122,7 +123,7 @@ class Figures:
             "faults.line": faults.line(rows),
             "figures.machine": self._machine(),
         }
-        return {key: str(figure) for key, figure in self.figures.items()} | other
+        return {key: str(figure) for key, figure in self.figures.items()} | other | cells.texts()
 
     def _machine(self) -> str:
         """Return a sentence for each run: processor, load, versions and date."""
