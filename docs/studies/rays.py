@@ -43,7 +43,7 @@ def main() -> None:
             name = str(drive.setting)
             store, base = (
                 ActorStore(given.work / "scores" / name / "actors"),
-                BY_NAME["align, evidence"],
+                BY_NAME["align, free space"],
             )
             store.folder.mkdir(parents=True, exist_ok=True)
             for grid in GRIDS:
