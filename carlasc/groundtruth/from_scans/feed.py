@@ -16,11 +16,19 @@ from uuid import uuid4
 
 import numpy as np
 
-from carlasc.core.arrays import AnyArray, BoolArray, Float32Array, IntArray, LabelArray
-from carlasc.core.geometry import Transform, thin
+from carlasc.core.arrays import (
+    AnyArray,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    LabelArray,
+)
+from carlasc.core.geometry import Transform, invert, thin, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan, check_finite, lengths, sorted_by_origin
 from carlasc.errors import FormatError, MissingDataError
+from carlasc.groundtruth.from_scans.free_space import FreeSpace
 from carlasc.groundtruth.from_scans.merging import Instant, Merger, PreparedScan
 from carlasc.groundtruth.inputs import without_caches
 from carlasc.groundtruth.options import FromScans
@@ -135,6 +143,7 @@ class ScanFeed:
         )
         self._scans: OrderedDict[int, PreparedScan] = OrderedDict()
         self._merger: Merger | None = None
+        self._free: FreeSpace | None = None
         self._lock = threading.RLock()  # an executor may be of threads
         self.key = uuid4().hex
 
@@ -281,9 +290,8 @@ class ScanFeed:
         # The farthest corner of the grid and the farthest point of the scan, both as spheres: a
         # scan that cannot reach the grid costs as much as one that does.
         here = self.pose(frame)
-        corners = np.array(np.meshgrid(*zip(spec.lower, spec.upper, strict=True))).reshape(3, -1).T
         across = (
-            float(np.linalg.norm(corners, axis=1).max())
+            float(np.linalg.norm(_corners(spec), axis=1).max())
             if spec.coordinates == "cartesian"
             else np.hypot(spec.upper[0], max(abs(spec.lower[2]), abs(spec.upper[2])))
         )
@@ -326,6 +334,23 @@ class ScanFeed:
             self._merger.actors = actors
             self._merger.forget_before(frame + self.options.window[0])
             return self._merger
+
+    def free_space(self, spec: GridSpec, step_m: float, views: bool) -> FreeSpace:
+        """Return the maps of free space, which are kept from frame to frame."""
+        first, last = self.options.window
+        corners = _corners(spec)
+
+        def corners_of(frame: int) -> FloatArray:
+            near = self.frames[(self.frames >= frame - last) & (self.frames <= frame - first)]
+            return np.concatenate(
+                [transform_points(self.pose(other), corners) for other in near.tolist()]
+            )
+
+        with self._lock:
+            if self._free is None or self._free.key != (spec, step_m, views):
+                map_T_world = invert(self.pose(int(self.frames[0])))
+                self._free = FreeSpace(spec, step_m, views, map_T_world, corners_of)
+            return self._free
 
     def instant(self, frame: int) -> Instant:
         """Return the time and the pose of a frame."""
@@ -462,6 +487,14 @@ class ScanFeed:
         with np.errstate(invalid="ignore", over="ignore"):
             distance = lengths(scan.points if origins is None else scan.points - origins)
             return (distance >= self.min_range_m) & (distance <= self.max_range_m)
+
+
+def _corners(spec: GridSpec) -> FloatArray:
+    """Return the (8, 3) corners of the box around a grid, metres."""
+    lower, upper = list(spec.lower), list(spec.upper)
+    if spec.coordinates == "cylindrical":
+        lower[:2], upper[:2] = [-upper[0]] * 2, [upper[0]] * 2
+    return np.array(np.meshgrid(*zip(lower, upper, strict=True)), np.float64).reshape(3, -1).T
 
 
 _FEEDS: dict[str, ScanFeed] = {}  # the feed of this process, by the key of its copies: see ScanFeed

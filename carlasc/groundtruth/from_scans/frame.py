@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from itertools import chain
@@ -24,6 +24,7 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.groundtruth.from_scans.actor_voxels import find_voxels
 from carlasc.groundtruth.from_scans.feed import ScanFeed
+from carlasc.groundtruth.from_scans.free_space import FreeSpace
 from carlasc.groundtruth.from_scans.merging import STATIC, BodyRegions, Instant, Merger
 from carlasc.groundtruth.inputs import FrameData, GridPlan
 from carlasc.groundtruth.voting.ballot import Ballot, Observation, Votes
@@ -75,22 +76,24 @@ def merge_frame(
         feed.classes,
     )
 
-    merger.rays = options.rays if plan.rule == "ray" else "all"
-
-    # The static scene votes in all voxels, and each moving actor in the voxels of its body.
+    # Free space comes from maps, in which each ray is followed once for all frames. The frame's own
+    # rays count everywhere, and those of other scans outside of bodies, or in the body of an actor.
     regions = BodyRegions.at(merger, now, window, plan.spec)
-    steps, bodies = _FrameSteps(plan, feed, merger, now, window, regions), regions.actors
-    recent = merger.recent(now, window)  # first, to know which voxels they saw
-    ballot = steps.ballot(count_views=plan.needs_evidence)
-    for observation in merger.observations(now, recent):
-        ballot.add(observation)
-    seen_now = ballot.seen()
-    others = merger.observations(now, (other for other in window if other not in recent))
-    for observation in chain(others, merger.in_bodies(now, window, bodies)):
-        ballot.add(observation)
-    votes, views = ballot.votes(copy=False), ballot.views if plan.needs_evidence else None
+    space = feed.free_space(plan.spec, plan.voting.free_step_m, plan.rule == "sensor")
+    space.forget_others(merger.actors.tracks)
+    steps = _FrameSteps(plan, feed, merger, now, window, regions, space)
+    own = steps.vote([merger.own(now)] if frame in window else [])
+    own_free, seen_now = own.free[steps.in_body], own.seen()
+    del own  # frees memory for the next ballots
+    # The static scene votes in all voxels, and each moving actor in the voxels of its body.
+    points = merger.observations(now, window), merger.in_bodies(now, window, regions, plan.spec)
+    ballot = steps.vote(chain(*points))
+    ballot.free[:] = space.of_scene(merger, now, window)
+    ballot.free[steps.in_body] = own_free
+    space.in_bodies(merger, now, window, regions, ballot.free)
+    votes = ballot.votes(copy=False)
+    del ballot
     # The votes are whole now: what follows decides, completes and corrects, in this order.
-    del ballot  # frees memory for the next ballots
     if plan.rule != "ray":
         whole = votes.to_grid()
         return FrameData(
@@ -101,22 +104,21 @@ def merge_frame(
 
     # In these voxels, free space of rays beside a body or of other times does not count.
     contested = steps.contested()
-    unseen = contested[~seen_now[contested]]
-    if len(unseen):  # recent scans may have moving points there
-        unseen = unseen[~steps.vote(merger.moving(now, recent)).hit[unseen]]
+    recent = merger.recent(now, window) if len(contested) else []
+    unseen = contested[~space.is_seen(merger, now, recent, contested)]
     doubtful = np.concatenate([regions.hidden, unseen])
     made.forget(doubtful[made.labels[doubtful] == 0])
 
     # Actors are completed by their mirror images, then by the surfaces of their tracks.
-    completing = list[Iterator[Observation]]()
-    if bodies and options.complete != "seen":
-        completing.append(merger.in_bodies(now, window, bodies, mirror=True))
-        if options.complete == "body":
-            completing.append(merger.shells(now, bodies))
     completed = list[tuple[IntArray, AnyArray]]()
-    for observations in completing:
-        completions = steps.vote(observations).votes(copy=False)
-        completed.append(steps.complete(made, completions))
+    if regions.actors and options.complete != "seen":
+        mirrored = steps.vote(merger.in_bodies(now, window, regions, plan.spec, mirror=True))
+        space.in_bodies(merger, now, window, regions, mirrored.free, mirror=True)
+        completed.append(steps.complete(made, mirrored.votes(copy=False)))
+        if options.complete == "body":
+            del mirrored
+            shells = steps.vote(merger.shells(now, regions, plan.spec))
+            completed.append(steps.complete(made, shells.votes(copy=False)))
 
     # After completion: an inferred body must not stand where the recording vehicle drove.
     if options.own_path and options.dynamic != "tube":
@@ -131,14 +133,21 @@ def merge_frame(
         made.labels[np.isin(made.labels, sorted(classes.ground))] = classes.geometry_id
     size = plan.spec.size
     grid = Grid(plan.spec, made.labels.reshape(size), made.counts.reshape(size))
-    if made.occupied is None or views is None:
+    if made.occupied is None:
         return FrameData({}, grid, votes, None, who, votes.boxes)
     inferred = np.concatenate([_NO_VOXELS, *(voxels for voxels, _ in completed)])
     flags, shares = (
-        steps.flags(inferred, contested),
+        steps.flags(inferred, contested, seen_now),
         _join_shares(votes, consensus, completed, classes),
     )
-    evidence = VoxelCertainty(made.occupied.reshape(size), shares, flags.reshape(size), views)
+    views = space.views(merger, now, window)
+    views[steps.in_body] = 0  # rays of other times
+    np.maximum.at(views, votes.occupied["voxel"], votes.occupied["voters"])
+    np.maximum(views, made.counts > 0, out=views)  # free space is summed over smaller cells
+    views_of_voxels = views.astype(np.uint16).reshape(size)
+    evidence = VoxelCertainty(
+        made.occupied.reshape(size), shares, flags.reshape(size), views_of_voxels
+    )
     return FrameData({}, grid, votes, evidence, who, votes.boxes)
 
 
@@ -237,6 +246,7 @@ class _FrameSteps:
     now: Instant
     window: list[int]
     regions: BodyRegions
+    space: FreeSpace
 
     @cached_property
     def in_body(self) -> BoolArray:
@@ -308,35 +318,27 @@ class _FrameSteps:
             self.plan.spec, self.feed, merger.actors, self.now, self.regions, self.window, labels
         )
 
-    def flags(self, inferred: IntArray, contested: IntArray) -> Uint8Array:
+    def flags(self, inferred: IntArray, contested: IntArray, seen_now: BoolArray) -> Uint8Array:
         """Return (V,) uint8: the flags of each voxel."""
-        own = [self.now.frame] if self.now.frame in self.window else []
-        now = self.vote(self.merger.observations(self.now, own))
         flags = np.zeros(self.plan.spec.num_voxels, np.uint8)
         for where, flag in (
             (inferred, VoxelFlag.INFERRED),
             (contested, VoxelFlag.CONTESTED),
-            (now.seen(), VoxelFlag.SEEN_NOW),
+            (seen_now, VoxelFlag.SEEN_NOW),
             (self.in_body, VoxelFlag.IN_ACTOR),
         ):
             flags[where] |= np.uint8(flag)
         return flags
 
-    def ballot(self, count_views: bool = False) -> Ballot:
-        """Return a ballot without votes."""
-        return Ballot(
+    def vote(self, observations: Iterable[Observation]) -> Ballot:
+        """Return the votes of observations."""
+        ballot = Ballot(
             self.plan.spec,
             self.feed.classes,
             rule=self.plan.rule,
             free_step_m=self.plan.voting.free_step_m,
-            regions=self.regions.of_voxel,
-            count_views=count_views,
             keep_boxes=self.plan.voting.keep_seen,
         )
-
-    def vote(self, observations: Iterable[Observation]) -> Ballot:
-        """Return the votes of observations, each in its region."""
-        ballot = self.ballot()
         for observation in observations:
             ballot.add(observation)
         return ballot

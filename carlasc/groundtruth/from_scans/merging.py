@@ -15,25 +15,26 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.core.arrays import (
     AnyFloatArray,
+    AnyIntArray,
     BoolArray,
     Float32Array,
     FloatArray,
     Int32Array,
     IntArray,
     LabelArray,
-    Uint8Array,
     Uint16Array,
 )
+from carlasc.core.cells import voxels_of
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import RaysFromPlace, lengths, runs_of_origins
-from carlasc.groundtruth.options import Dynamic, Rays
-from carlasc.groundtruth.voting.ballot import NOWHERE, Observation
+from carlasc.groundtruth.options import Dynamic
+from carlasc.groundtruth.voting.ballot import Observation
+from carlasc.groundtruth.voting.free_maps import Cast
 from carlasc.motion import BODY_MARGIN_M
 from carlasc.motion.tracks import MovingActors, Track
 from carlasc.storage import layout
@@ -45,11 +46,7 @@ _RECENT_S = 0.25  # scans within this time before and after a frame show the sce
 # Points so near to the body of an actor may belong to it, as paths have errors: metres along,
 # across and up.
 _AROUND_M = np.array([0.3, 0.3, 0.1])
-_MIRROR, _MIRRORED = np.diag([1.0, -1.0, 1.0, 1.0]), np.array([1, -1, 1], np.float32)
-# area of a sphere around the sensor, over the number of points, in which one ray is enough
-_POINT_M2 = 0.004
-# 2 ** 32 times the fractional parts of the golden ratio and of the square root of 2
-_GOLDEN, _SILVER = 2654435769, 1779033703  # their multiples modulo 2 ** 32 are evenly spread
+MIRROR, _MIRRORED = np.diag([1.0, -1.0, 1.0, 1.0]), np.array([1, -1, 1], np.float32)
 
 
 @dataclass(frozen=True)
@@ -165,44 +162,32 @@ class PreparedScan:
             else self.world_T_sensor
         )
 
-    @cached_property
-    def enough(self) -> tuple[NDArray[np.intp], Uint8Array]:
-        """(M,) indices of the rays that vote with `rays="enough"`, and their (M,) weights: near the
-        sensor, one of up to four votes for all.
-
-        The choice depends on the frame number and the index of the ray alone, so that scans of one
-        place use different rays.
-        """
-        crowd = (
-            len(self.ends) * _POINT_M2 / np.maximum(np.square(lengths(self.ends)), np.float32(1e-3))
-        )
-        power = ((crowd >= 2).astype(np.uint32) + (crowd >= 4)).astype(np.uint32)
-        turn = np.arange(len(power), dtype=np.uint32) * np.uint32(_GOLDEN) + np.uint32(
-            self.frame * _SILVER % 2**32
-        )
-        chosen = np.flatnonzero(turn <= np.uint32(2**32 - 1) >> power)
-        return chosen, np.left_shift(1, power[chosen]).astype(np.uint8)
-
-    def votes_of(self, labels: Uint16Array, hits: BoolArray | None) -> dict[str, Any]:
-        """Return arguments of `Observation` for the votes of the scan: all except poses and
-        regions.
+    def cast(self, map_T_world: Transform, lower: FloatArray, upper: FloatArray) -> Cast:
+        """Return the rays for a map of free space: those that pass through a region.
 
         Args:
-            labels: (N,) uint16, the classes of the points.
-            hits: (N,) bool, points that vote for their class; None: all.
+            map_T_world: (4, 4).
+            lower: (3,) lower corner of the region, metres, frame of the map.
+            upper: (3,) upper corner.
         """
-        ends = (
-            None
-            if self.world_T_places.ndim == 2
-            else np.array([rays.part.stop for rays in self.rays])
+        places = (map_T_world @ self.world_T_places).reshape(-1, 4, 4)
+        # where no point is, no ray is
+        reached = np.concatenate([places[:, :3, 3] - self.reach_m, places[:, :3, 3] + self.reach_m])
+        lower, upper = (
+            np.maximum(lower, reached.min(axis=0)),
+            np.minimum(upper, reached.max(axis=0)),
         )
-        return {
-            "points": self.ends,
-            "labels": labels,
-            "hits": hits,
-            "sure": self.sure,
-            "ends": ends,
-        }
+        return Cast(self.ends, self.runs, places, lower, upper)
+
+    @property
+    def runs(self) -> IntArray:
+        """(K,) index after the last ray of each origin."""
+        return np.array([rays.part.stop for rays in self.rays])
+
+    def from_places(self) -> dict[str, Any]:
+        """Return arguments of `Observation`: the rays, and the runs of their origins."""
+        ends = None if self.world_T_places.ndim == 2 else self.runs
+        return {"points": self.ends, "sure": self.sure, "ends": ends}
 
     def through(
         self, world_T_box: Transform, lower: FloatArray, upper: FloatArray
@@ -218,6 +203,19 @@ class PreparedScan:
         for rays in self.rays:
             box_T_place = invert(world_T_box) @ self.world_T_sensor @ rays.sensor_T_place
             yield rays, box_T_place, rays.through(box_T_place, lower, upper)
+
+
+@dataclass(frozen=True)
+class _Carried:
+    """What a scan saw of the body of an actor, in the frame of the actor.
+
+    Attributes:
+        cast: the rays through the body.
+        points: (M, 3) float32, metres, the points of the actor.
+    """
+
+    cast: Cast
+    points: Float32Array
 
 
 class Merger:
@@ -238,106 +236,116 @@ class Merger:
         dynamic: Dynamic,
     ) -> None:
         self.scan_of, self.actors, self.classes, self.dynamic = scan_of, actors, classes, dynamic
-        self.rays: Rays = "all"
         self._static: dict[int, BoolArray] = {}
         self._labels: dict[int, Uint16Array] = {}
-        self._carried: dict[tuple[int, int], tuple[Observation, ...]] = {}
-        self._sampled: dict[int, dict[str, Any]] = {}
+        self._carried: dict[tuple[int, int], _Carried | None] = {}
+        self._points: dict[int, tuple[Float32Array, Uint16Array, Float32Array | None]] = {}
         self._moving: dict[int, tuple[Float32Array, Uint16Array]] = {}
 
     def forget_before(self, frame: int) -> None:
         """Clear the caches of scans before a frame."""
-        for kept in (self._static, self._labels, self._moving, self._sampled):
+        for kept in (self._static, self._labels, self._moving, self._points):
             for other in [key for key in kept if key < frame]:
                 del kept[other]
         self._carried = {key: value for key, value in self._carried.items() if key[1] >= frame}
 
-    def observations(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
-        """Yield the observation of the static scene by each scan.
+    def own(self, now: Instant) -> Observation:
+        """Return the observation by the frame's own scan, whose rays count everywhere."""
+        scan = self.scan_of(now.frame)
+        hits = None
+        if self.dynamic == "drop":
+            hits = self.static(now.frame)
+        elif self.actors.own:  # points on the recording vehicle do not vote
+            hits = ~self.actors.is_own(scan.points)
+        places = now.grid_T_world @ scan.world_T_places
+        return Observation(
+            labels=self.labels(now.frame), grid_T_sensor=places, hits=hits, **scan.from_places()
+        )
 
-        Static surfaces vote everywhere, so the road below an actor is kept. Free space from other
-        times does not count in the bodies of actors. The frame's own rays always count.
+    def observations(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
+        """Yield the static points of each scan, and all points of the frame's own scan.
+
+        Static surfaces vote everywhere, so the road below an actor is kept.
 
         Args:
             now: the frame.
             window: frames of the scans.
         """
-        grid_T_world = now.grid_T_world
         for other in window:
-            scan, own = self.scan_of(other), other == now.frame
-            everything = self.dynamic == "tube" or (own and self.dynamic != "drop")
-            hits = None if everything else self.static(other)
-            if everything and self.actors.own:  # points on the recording vehicle do not vote
-                hits = ~self.actors.is_own(scan.points)
-            sampled = self.rays == "enough" and not own
-            votes = self._enough(scan, hits) if sampled else scan.votes_of(self.labels(other), hits)
-            places = grid_T_world @ scan.world_T_places
-            yield Observation(grid_T_sensor=places, free_region=None if own else STATIC, **votes)
-
-    def _enough(self, scan: PreparedScan, hits: BoolArray | None) -> dict[str, Any]:
-        """Return the votes of the rays that are enough: prepared once, for all frames that use
-        them.
-        """
-        if scan.frame not in self._sampled:
-            votes, (chosen, weights) = scan.votes_of(self.labels(scan.frame), hits), scan.enough
-            ends = votes.pop("ends")
-            parts = {
-                name: None if values is None else values[chosen] for name, values in votes.items()
-            }
-            parts["ends"] = None if ends is None else np.searchsorted(chosen, ends)
-            self._sampled[scan.frame] = {**parts, "weights": weights}
-        return self._sampled[scan.frame]
+            if other == now.frame:
+                yield replace(self.own(now), rays=False)
+                continue
+            scan = self.scan_of(other)
+            if other not in self._points:
+                voting = np.flatnonzero(
+                    ~self.actors.is_own(scan.points)
+                    if self.dynamic == "tube"
+                    else self.static(other)
+                )
+                sure = None if scan.sure is None else scan.sure[voting]
+                self._points[other] = scan.points[voting], self.labels(other)[voting], sure
+            points, labels, sure = self._points[other]
+            pose = now.grid_T_world @ scan.world_T_sensor
+            yield Observation(points, labels, pose, sure=sure, rays=False)
 
     def in_bodies(
         self,
         now: Instant,
         window: Iterable[int],
-        bodies: Mapping[int, int],
+        regions: BodyRegions,
+        spec: GridSpec,
         *,
         mirror: bool = False,
     ) -> Iterator[Observation]:
-        """Yield the observation of each actor's body by other scans, with a voter for each origin
-        of rays.
+        """Yield the points of each actor in the voxels of its body, by other scans.
 
         Args:
             now: the frame.
             window: frames of the scans.
-            bodies: number of the actor by region, for the actors that vote in their bodies.
-            mirror: yield mirror images instead. Vehicles are symmetric: their points and rays are
-                reflected in the vertical plane through the middle of the body, if that is known.
-                Only mirror images use the frame's own scan.
+            regions: the voxels of the bodies.
+            spec: the grid.
+            mirror: yield mirror images instead. Vehicles are symmetric: their points are reflected
+                in the vertical plane through the middle of the body, if that is known. Only mirror
+                images use the frame's own scan.
         """
-        window = [other for other in window if mirror or other != now.frame]
-        for region, number in bodies.items():
-            track = self.actors.tracks[number]
+        for region, number in regions.actors.items():
+            track, seen = self.actors.tracks[number], self.seen(number, now, window, mirror)
             pose = track.pose(now.frame)
-            if pose is None or (mirror and not (track.rigid and any(track.extent.known))):
+            if not seen or pose is None:
                 continue
-            # Rays are carried in the frame of the actor, where they do not depend on the frame that
-            # is made: they are computed once for all frames of the window.
-            seen = list[Observation]()
-            for other in window:
-                seen += self._carry(number, other, now)
-            if not seen:
-                continue
-            points = np.concatenate([carried.points for carried in seen])
-            places = np.stack([carried.grid_T_sensor for carried in seen])
+            points = np.concatenate([carried.points for carried in seen.values()])
+            ends = np.cumsum([len(carried.points) for carried in seen.values()])
             grid_T_actor = now.grid_T_world @ pose
+            points = points * _MIRRORED if mirror else points
+            voxels = voxels_of(points, grid_T_actor, spec)
             yield Observation(
-                points * _MIRRORED if mirror else points,
-                np.concatenate([carried.labels for carried in seen]),
-                grid_T_actor @ _MIRROR @ places @ _MIRROR if mirror else grid_T_actor @ places,
-                np.concatenate([carried.hits for carried in seen if carried.hits is not None]),
-                hit_region=region,
-                free_region=region,
-                ends=np.cumsum([len(carried) for carried in seen]),
+                points,
+                np.full(len(points), track.label, np.uint16),
+                np.repeat(grid_T_actor[None], len(ends), axis=0),
+                hits=regions.contain(region, voxels),
+                ends=ends,
+                rays=False,
             )
 
-    def moving(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
-        """Yield the moving points of each scan, at their positions in that scan.
-
-        No ray votes for free space.
+    def seen(
+        self, number: int, now: Instant, window: Iterable[int], mirror: bool
+    ) -> dict[int, _Carried]:
+        """Return what the scans of a window saw of the body of an actor, by frame: without the
+        frame's own scan, or with it for a mirror image; nothing if it has no mirror image.
         """
+        track = self.actors.tracks[number]
+        if mirror and not (track.rigid and any(track.extent.known)):
+            return {}
+        found = {}
+        for other in window:
+            if mirror or other != now.frame:
+                carried = self._carry(number, other, now)
+                if carried is not None:
+                    found[other] = carried
+        return found
+
+    def moving(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
+        """Yield the moving points of each scan, at their positions in that scan."""
         for other in window:
             scan = self.scan_of(other)
             if other not in self._moving:
@@ -346,7 +354,7 @@ class Merger:
             points, labels = self._moving[other]
             if len(points):
                 yield Observation(
-                    points, labels, now.grid_T_world @ scan.world_T_sensor, free_region=NOWHERE
+                    points, labels, now.grid_T_world @ scan.world_T_sensor, rays=False
                 )
 
     def recent(self, now: Instant, window: Iterable[int]) -> list[int]:
@@ -355,20 +363,17 @@ class Merger:
             other for other in window if abs(self.scan_of(other).seconds - now.seconds) <= _RECENT_S
         ]
 
-    def shells(self, now: Instant, bodies: Mapping[int, int]) -> Iterator[Observation]:
-        """Yield the surface of each vehicle, for the parts that no scan saw.
-
-        No ray votes for free space.
-        """
-        for region, number in bodies.items():
+    def shells(self, now: Instant, regions: BodyRegions, spec: GridSpec) -> Iterator[Observation]:
+        """Yield the surface of each vehicle in its body, for the parts that no scan saw."""
+        for region, number in regions.actors.items():
             track = self.actors.tracks[number]
             pose = track.pose(now.frame)
             points = track.surface
             if len(points) and pose is not None:
+                grid_T_actor = now.grid_T_world @ pose
+                own = regions.contain(region, voxels_of(points, grid_T_actor, spec))
                 labels = np.full(len(points), track.label, np.uint16)
-                yield Observation(
-                    points, labels, now.grid_T_world @ pose, hit_region=region, free_region=NOWHERE
-                )
+                yield Observation(points, labels, grid_T_actor, hits=own, rays=False)
 
     def static(self, frame: int) -> BoolArray:
         """Return (N,) bool: the points of a scan that belong to no moving actor.
@@ -404,23 +409,30 @@ class Merger:
             self._labels[frame] = labels
         return self._labels[frame]
 
-    def _carry(self, number: int, other: int, now: Instant) -> tuple[Observation, ...]:
-        """Return the rays of a scan through the body of an actor, in the actor frame; none if the
+    def _carry(self, number: int, other: int, now: Instant) -> _Carried | None:
+        """Return what a scan saw of the body of an actor; None if no ray passed through it, or the
         shape of the actor was different then.
         """
         track = self.actors.tracks[number]
         if not track.rigid and abs(self.scan_of(other).seconds - now.seconds) > _DEFORMABLE_S:
-            return ()
-        pose, through = track.pose(other), list[Observation]()
-        if (number, other) not in self._carried and pose is not None:
+            return None
+        key, pose = (number, other), track.pose(other)
+        if key not in self._carried and pose is not None:
             scan = self.scan_of(other)
             own = np.zeros(len(scan.points), np.bool_)
             own[track.members.get(other, [])] = True
-            for rays, actor_T_place, crossing in scan.through(pose, track.lower, track.upper):
+            rays, hits, places = [], [], []
+            for part, actor_T_place, crossing in scan.through(pose, track.lower, track.upper):
                 if len(crossing):
-                    labels, hits = self.labels(other)[rays.part][crossing], own[rays.part][crossing]
-                    through.append(Observation(rays.points[crossing], labels, actor_T_place, hits))
-        return self._carried.setdefault((number, other), tuple(through))
+                    rays.append(part.points[crossing])
+                    seen = rays[-1][own[part.part][crossing]]
+                    hits.append(transform_points(actor_T_place, seen).astype(np.float32))
+                    places.append(actor_T_place)
+            if rays:
+                ends = np.cumsum([len(points) for points in rays])
+                cast = Cast(np.concatenate(rays), ends, np.stack(places), track.lower, track.upper)
+                self._carried[key] = _Carried(cast, np.concatenate(hits))
+        return self._carried.setdefault(key, None)
 
 
 def _points_near(track: Track, scan: PreparedScan) -> IntArray:
@@ -481,6 +493,13 @@ class BodyRegions:
                 spec, transform_points(now.grid_T_world @ scan.world_T_sensor, moving)
             )
         return regions
+
+    def contain(self, region: int, voxels: AnyIntArray) -> BoolArray:
+        """Return (N,) bool: which voxels, flat indices, belong to a region; those outside of the
+        grid do not.
+        """
+        own = self.of_voxel.take(voxels, mode="clip") == region
+        return own & (voxels < len(self.of_voxel))
 
     def with_points(self, spec: GridSpec, points: AnyFloatArray) -> BodyRegions:
         """Return the regions with another one for the voxels of moving points without a body.

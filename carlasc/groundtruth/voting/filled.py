@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from carlasc.core.arrays import Uint8Array, Uint16Array
+from carlasc.core.arrays import Uint8Array
 from carlasc.core.cells import Cells, transform
 from carlasc.core.compiling import cached
-from carlasc.groundtruth.voting.kernel import ANYWHERE, Voters
+from carlasc.groundtruth.voting.kernel import Voters
 
 STEPS = 256  # number of steps of a box along an edge of a voxel
 
@@ -23,23 +23,19 @@ def no_boxes(num_voxels: int) -> Uint8Array:
 
 
 @cached
-def widen_boxes(
-    cast: Voters, cells: Cells, region: int, regions: Uint16Array, boxes: Uint8Array
-) -> None:
+def widen_boxes(cast: Voters, cells: Cells, boxes: Uint8Array) -> None:
     """Widen the boxes of Cartesian voxels by the points of an observation that vote for their
     classes.
 
     Args:
         cast: the observation.
         cells: the cells of the grid.
-        region: region in which points vote, or ANYWHERE.
-        regions: (V + 1,) region of each voxel; empty if the grid has none.
         boxes: (V, 6) uint8; widened: first and last x, y, z in 1/256 of a voxel, from its lower
             corner.
     """
     # The rule of `find_voxel`, whose quotients are needed here too. Points that rounding puts
     # beyond the last cell widen no box.
-    points, labels, hits, _, _, poses, ends = cast
+    points, labels, hits, _, poses, ends = cast
     scaled, begin = np.empty(3), 0
     for place in range(len(ends)):
         p = poses[place]
@@ -53,7 +49,7 @@ def widen_boxes(
                 scaled[axis] = (at[axis] - cells.lower[axis]) / cells.voxel_size[axis]
                 inside &= 0 <= scaled[axis] < cells.size[axis]
                 voxel = voxel * cells.size[axis] + int(scaled[axis])
-            if inside and (region == ANYWHERE or regions[voxel] == region):
+            if inside:
                 for axis in range(3):
                     step = np.uint8((scaled[axis] - int(scaled[axis])) * STEPS)
                     boxes[voxel, axis] = min(boxes[voxel, axis], step)

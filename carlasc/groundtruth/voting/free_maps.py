@@ -1,0 +1,359 @@
+"""Maps of free space: each ray is followed once, into cells that are fixed in a frame, and every
+grid takes its free space from these cells.
+
+The cells are smaller than the voxels, and stored in blocks, so that memory grows with the space
+that rays pass through. Counts are integers: scans are added and removed in any order, and a grid
+does not depend on the grids that were made before it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection
+from typing import NamedTuple
+
+import numpy as np
+
+from carlasc.core.arrays import (
+    Float32Array,
+    FloatArray,
+    Int32Array,
+    IntArray,
+    Uint32Array,
+)
+from carlasc.core.cells import Cells, Pose, as_pose, transform
+from carlasc.core.compiling import cached, inlined
+from carlasc.core.geometry import Transform
+from carlasc.core.grids import GridSpec
+
+_BITS = 4  # a block has 2 ** _BITS cells along each edge
+_EDGE = 1 << _BITS
+_CELL_M = 0.05  # height of a cell; rays that graze the ground decide it
+_ACROSS, _MOST_UP = 2, 8  # number of cells along the edges of a voxel: in x and y, greatest in z
+_FEWEST = 64  # least number of blocks by which a map grows
+_SLACK = 1e-6  # of the number of a sample, where a ray enters and leaves a region
+
+
+class Cast(NamedTuple):
+    """The rays of one scan.
+
+    Attributes:
+        points: (N, 3) float32, metres, from the origin of each ray, in the order of origins.
+        ends: (K,) index after the last point of each origin.
+        map_T_places: (K, 4, 4) poses of the origins.
+        lower: (3,) lower corner of the region in which the rays count, metres, frame of the map.
+        upper: (3,) upper corner.
+    """
+
+    points: Float32Array
+    ends: IntArray
+    map_T_places: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+
+
+class _Blocks(NamedTuple):
+    """The blocks of a map.
+
+    Attributes:
+        first: (3,) the first block of `slots` along each axis.
+        slots: (X, Y, Z) index of each block in `counts`; -1 without one.
+        unused: (B,) indices that are not in use.
+        left: (1,) how many of them there are.
+        counts: (B, cells) samples in each cell.
+        stamps: (B, cells) the last scan that was added or removed; empty if every sample counts.
+    """
+
+    first: IntArray
+    slots: Int32Array
+    unused: Int32Array
+    left: IntArray
+    counts: Int32Array
+    stamps: Int32Array
+
+
+class FreeMap:
+    """The free space that the rays of some scans passed through, in cells.
+
+    Args:
+        spec: the grids that take their free space from the map.
+        step_m: distance between two samples of a ray, metres.
+        views: count the scans that saw each voxel, instead of samples in cells.
+        first: number of the first sample on a ray, counted from its point; 0: the point itself.
+    """
+
+    def __init__(
+        self, spec: GridSpec, step_m: float, views: bool = False, *, first: int = 1
+    ) -> None:
+        x, y, z = spec.voxel_size.tolist()
+        up = min(max(round(z / _CELL_M), _ACROSS), _MOST_UP)
+        # a cylindrical voxel is as wide as deep at some radius
+        size = (x, x if spec.coordinates == "cylindrical" else y, z)
+        self.spec, self.views, self._stamp = spec, views, 0
+        self._samples = float(first), step_m
+        self._parts = (1, 1, 1) if views else (_ACROSS, _ACROSS, up)
+        self._cell = np.array(size) / self._parts
+        self._margin_m = np.linalg.norm(size)  # a voxel that touches a region is counted whole
+        self._held = dict[int, tuple[Cast, IntArray, IntArray]]()
+        self._clear()
+
+    def _clear(self) -> None:
+        self._held.clear()
+        none = np.empty((0, _EDGE**3), np.int32)
+        slots = np.empty((0, 0, 0), np.int32)
+        left = np.zeros(1, np.int64)
+        self._blocks = _Blocks(np.zeros(3, np.int64), slots, none[:, 0].copy(), left, none, none)
+
+    def hold(self, scans: Collection[int], cast_of: Callable[[int], Cast]) -> None:
+        """Add and remove scans, so that the map has the rays of some scans and no others.
+
+        Args:
+            scans: numbers of the scans.
+            cast_of: returns the rays of a scan.
+        """
+        others = [scan for scan in self._held if scan not in scans]
+        if 2 * len(others) > len(self._held):  # begin anew, which is faster
+            self._clear()
+        else:
+            for scan in others:
+                self._trace(*self._held.pop(scan), -1)
+        for scan in scans:
+            if scan not in self._held:
+                cast = cast_of(scan)
+                lower = (
+                    np.floor((cast.lower - self._margin_m) / self._cell).astype(np.int64) >> _BITS
+                )
+                upper = (
+                    np.floor((cast.upper + self._margin_m) / self._cell).astype(np.int64) >> _BITS
+                ) + 1
+                self._make_room(lower, upper)
+                self._trace(cast, lower, upper, 1)
+                self._held[scan] = cast, lower, upper
+
+    def _trace(self, cast: Cast, lower: IntArray, upper: IntArray, sign: int) -> None:
+        self._stamp += 1
+        points = np.ascontiguousarray(cast.points).reshape(-1)
+        places = (cast.map_T_places[:, :3] / self._cell[:, None]).reshape(-1, 12)
+        region, numbers = (lower * _EDGE, upper * _EDGE), np.array([sign, self._stamp], np.int32)
+        ray = 0
+        while True:
+            ray = _trace(
+                points, cast.ends, places, ray, region, self._samples, numbers, self._blocks
+            )
+            if ray == len(cast.points):
+                return
+            self._grow()
+
+    def _grow(self) -> None:
+        """Make room for more blocks."""
+        # The memory of new blocks is not used before rays pass through them.
+        old, size = self._blocks, len(self._blocks.counts)
+        left, more = int(old.left[0]), max(size // 4, _FEWEST)
+        new = np.zeros((more, _EDGE**3), np.int32)
+        counts = np.concatenate([old.counts, new])
+        stamps = np.concatenate([old.stamps, new]) if self.views else old.stamps
+        # the last ones are taken first: memory that was used before
+        unused = np.concatenate([np.arange(size + more - 1, size - 1, -1), old.unused[:left]])
+        unused = np.concatenate([unused, np.zeros(size - left, np.int64)]).astype(np.int32)
+        old.left[0] = left + more
+        self._blocks = old._replace(counts=counts, stamps=stamps, unused=unused)
+
+    def _make_room(self, lower: IntArray, upper: IntArray) -> None:
+        """Extend the index of blocks to a region, and release blocks that no region contains."""
+        old = self._blocks
+        if (lower >= old.first).all() and (upper <= old.first + old.slots.shape).all():
+            return
+        first = np.min([lower, *(held[1] for held in self._held.values())], axis=0)
+        last = np.max([upper, *(held[2] for held in self._held.values())], axis=0)
+        slots = np.full(last - first, -1, np.int32)
+        low = np.maximum(first, old.first)
+        high = np.maximum(np.minimum(last, old.first + old.slots.shape), low)
+        kept = tuple(map(slice, low - old.first, high - old.first))
+        slots[tuple(map(slice, low - first, high - first))] = old.slots[kept]
+        gone = old.slots.copy()
+        gone[kept] = -1
+        gone = gone[gone >= 0]
+        count = int(old.left[0])
+        old.unused[count : count + len(gone)] = gone
+        old.left[0] += len(gone)
+        self._blocks = old._replace(first=first, slots=slots)
+
+    def count(self, map_T_grid: Transform, voxels: IntArray | None = None) -> Uint32Array:
+        """Return the number of samples, or of scans, in each of (M,) voxels of a grid.
+
+        Args:
+            map_T_grid: (4, 4), which may mirror.
+            voxels: (M,) flat indices; None: all voxels.
+        """
+        cells_T_grid = map_T_grid.copy()
+        cells_T_grid[:3] /= self._cell[:, None]
+        found = np.empty(self.spec.num_voxels if voxels is None else len(voxels), np.uint32)
+        chosen = np.empty(0, np.int64) if voxels is None else voxels
+        parts, volume = self._parts, float(self._cell.prod())
+        _gather(
+            chosen, as_pose(cells_T_grid), Cells.of(self.spec), parts, volume, self._blocks, found
+        )
+        return found
+
+
+@inlined
+def _narrow(
+    step: float, last: float, start: float, stride: float, low: int, high: int
+) -> tuple[float, float]:
+    """Return the steps between `step` and `last` at which `start - step * stride` is between `low`
+    and `high`.
+    """
+    # comparisons with NaN (0 / 0) are false
+    inverse = 1.0 / stride
+    a, b = (start - low) * inverse, (start - high) * inverse
+    near, far = (a, b) if a < b else (b, a)
+    return (near if near > step else step), (far if far < last else last)
+
+
+@cached
+def _trace(
+    points: Float32Array,
+    ends: IntArray,
+    poses: FloatArray,
+    ray: int,
+    region: tuple[IntArray, IntArray],
+    samples: tuple[float, float],
+    numbers: Int32Array,
+    blocks: _Blocks,
+) -> int:
+    """Add the samples of rays in a region to the cells, or remove them; return the first ray for
+    which there may be no room, or the number of rays.
+
+    Args:
+        points: (3 N,) metres, from the origins of the rays.
+        ends: (K,) index after the last point of each origin.
+        poses: (K, 12) cells_T_place of the origins.
+        ray: the first ray.
+        region: (3,) first cell of the region, and the cell after the last one.
+        samples: number of the first sample on a ray, and the distance between two, metres.
+        numbers: 1 or -1, and a number of this call, which the cells that it changes get if views
+            are counted.
+        blocks: the blocks.
+    """
+    first, slots, unused, left, counts, stamps = blocks
+    views, step_m, sign, stamp = len(stamps) > 0, samples[1], numbers[0], numbers[1]
+    lower, upper = region
+    low_x, low_y, low_z = lower[0], lower[1], lower[2]
+    high_x, high_y, high_z = upper[0], upper[1], upper[2]
+    for place in range(len(ends)):
+        p = poses[place]
+        pose = (p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11])
+        for i in range(ray, ends[place]):
+            x, y, z = (
+                np.float64(points[3 * i]),
+                np.float64(points[3 * i + 1]),
+                np.float64(points[3 * i + 2]),
+            )
+            norm = math.sqrt(x * x + y * y + z * z)
+            if norm == 0.0:
+                continue
+            at_x, at_y, at_z = transform(pose, x, y, z)
+            share = step_m / norm
+            dx, dy, dz = (at_x - p[3]) * share, (at_y - p[7]) * share, (at_z - p[11]) * share
+            step, last = samples[0], np.ceil(norm / step_m) - 1.0
+            step, last = _narrow(step, last, at_x, dx, low_x, high_x)
+            step, last = _narrow(step, last, at_y, dy, low_y, high_y)
+            step, last = _narrow(step, last, at_z, dz, low_z, high_z)
+            step, last = np.ceil(step - _SLACK), np.floor(last + _SLACK)
+            if left[0] <= last - step:
+                return i
+            while step <= last:
+                cell_x = math.floor(at_x - step * dx)
+                cell_y = math.floor(at_y - step * dy)
+                cell_z = math.floor(at_z - step * dz)
+                step += 1.0
+                if (
+                    cell_x < low_x
+                    or cell_y < low_y
+                    or cell_z < low_z
+                    or cell_x >= high_x
+                    or cell_y >= high_y
+                    or cell_z >= high_z
+                ):
+                    continue
+                a = (cell_x >> _BITS) - first[0]
+                b = (cell_y >> _BITS) - first[1]
+                c = (cell_z >> _BITS) - first[2]
+                slot = slots[a, b, c]
+                if slot < 0:
+                    left[0] -= 1
+                    slot = slots[a, b, c] = unused[left[0]]
+                cell = ((((cell_x & (_EDGE - 1)) << _BITS) + (cell_y & (_EDGE - 1))) << _BITS) + (
+                    cell_z & (_EDGE - 1)
+                )
+                if views:
+                    if stamps[slot, cell] == stamp:
+                        continue
+                    stamps[slot, cell] = stamp
+                counts[slot, cell] += sign
+        ray = max(ray, ends[place])
+    return ray
+
+
+@cached
+def _gather(
+    voxels: IntArray,
+    pose: Pose,
+    cells: Cells,
+    parts: tuple[int, int, int],
+    volume: float,
+    blocks: _Blocks,
+    found: Uint32Array,
+) -> None:
+    """Sum the counts of the cells in voxels: at places that are evenly spread in each voxel."""
+    first, slots, _, _, counts, _ = blocks
+    across, along, up = parts
+    size, voxel_size = cells.size, cells.voxel_size
+    dx, dy, dz = (
+        pose[2] * voxel_size[2] / up,
+        pose[6] * voxel_size[2] / up,
+        pose[10] * voxel_size[2] / up,
+    )
+    first_x, first_y, first_z = first[0] << _BITS, first[1] << _BITS, first[2] << _BITS
+    end_x = slots.shape[0] << _BITS
+    end_y = slots.shape[1] << _BITS
+    end_z = slots.shape[2] << _BITS
+    for row in range(len(found)):
+        voxel = voxels[row] if len(voxels) else row
+        i, j, k = voxel // (size[1] * size[2]), voxel // size[2] % size[1], voxel % size[2]
+        low_z = cells.lower[2] + (k + 0.5 / up) * voxel_size[2]
+        weight, many = 1.0, along
+        if cells.cylindrical and along > 1:
+            radius = cells.lower[0] + (i + 0.5) * voxel_size[0]
+            wide = radius * voxel_size[1]
+            many = int(min(max(math.ceil(2 * wide / voxel_size[0]), 1.0), 16.0))
+            weight = wide * voxel_size[0] * voxel_size[2] / (across * many * up * volume)
+        total = 0
+        for a in range(across):
+            u = cells.lower[0] + (i + (a + 0.5) / across) * voxel_size[0]
+            for b in range(many):
+                x, y = u, cells.lower[1] + (j + (b + 0.5) / many) * voxel_size[1]
+                if cells.cylindrical:
+                    x, y = u * math.cos(y), u * math.sin(y)
+                at_x, at_y, at_z = transform(pose, x, y, low_z)
+                for c in range(up):
+                    cell_x = math.floor(at_x + c * dx) - first_x
+                    cell_y = math.floor(at_y + c * dy) - first_y
+                    cell_z = math.floor(at_z + c * dz) - first_z
+                    if (
+                        cell_x < 0
+                        or cell_y < 0
+                        or cell_z < 0
+                        or cell_x >= end_x
+                        or cell_y >= end_y
+                        or cell_z >= end_z
+                    ):
+                        continue
+                    slot = slots[cell_x >> _BITS, cell_y >> _BITS, cell_z >> _BITS]
+                    if slot >= 0:
+                        total += counts[
+                            slot,
+                            ((((cell_x & (_EDGE - 1)) << _BITS) + (cell_y & (_EDGE - 1))) << _BITS)
+                            + (cell_z & (_EDGE - 1)),
+                        ]
+        found[row] = max(round(total * weight), 1) if total > 0 else 0

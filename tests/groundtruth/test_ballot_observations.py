@@ -1,0 +1,78 @@
+import numpy as np
+import pytest
+
+from carlasc.core.grids import GridSpec
+from carlasc.errors import FormatError
+from carlasc.groundtruth.voting.ballot import Ballot, Observation
+
+SPEC = GridSpec("cartesian", (16, 16, 4), (-8, -8, -2), (8, 8, 2))
+
+
+def observation(seed=0, count=500, **options):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-9, 9, (count, 3)).astype(np.float32) * (1, 1, 0.25)
+    labels = rng.integers(1, 12, count).astype(np.uint16)
+    return Observation(points.astype(np.float32), labels, np.eye(4), **options)
+
+
+def tally(observations, rule="sensor"):
+    ballot = Ballot(SPEC, rule=rule, free_step_m=0.7)
+    for one in observations:
+        ballot.add(one)
+    return ballot.votes()
+
+
+def occupied(votes):
+    return {(int(r["voxel"]), int(r["label"])): int(r["votes"]) for r in votes.occupied}
+
+
+def test_points_that_do_not_hit_leave_their_rays():
+    one = observation()
+    hits = np.arange(500) % 3 == 0
+    part = tally([observation(hits=hits)])
+    assert (part.free == tally([one]).free).all()
+    only = tally([Observation(one.points[hits], one.labels[hits], one.grid_T_sensor)])
+    assert occupied(part) == occupied(only)
+
+
+def test_every_sample_counts_with_the_rule_ray_as_with_sample():
+    observations = [observation(seed) for seed in range(3)]
+    ray, sensor, sample = (tally(observations, rule) for rule in ("ray", "sensor", "sample"))
+    assert (ray.free == sample.free).all()
+    assert occupied(ray) == occupied(sample)
+    assert (ray.free >= sensor.free).all() and (ray.free > sensor.free).any()
+
+
+@pytest.mark.parametrize("rule", ["sensor", "sample", "ray"])
+@pytest.mark.parametrize("sure", [False, True])
+def test_an_observation_without_rays_leaves_only_its_points(rule, sure):
+    likely = np.random.default_rng(6).choice([0.25, 0.5, 1.0], 500).astype(np.float32)
+    options = {"sure": likely} if sure else {}
+    votes = tally([observation(rays=False, **options)], rule)
+    whole = tally([observation(**options)], rule)
+    assert not votes.free.any() and whole.free.any()
+    assert (votes.occupied == whole.occupied).all()
+
+
+def test_voters_of_one_observation_vote_as_observations_do():
+    poses = np.stack([np.eye(4), np.eye(4), np.eye(4)])
+    poses[1:, :3, 3] = (1.0, 0.5, 0.2), (-2.0, 0.1, 0.0)
+    one, ends = observation(), np.array([200, 200, 500])
+    parts = [
+        Observation(one.points[a:b], one.labels[a:b], pose)
+        for pose, a, b in zip(poses, [0, *ends[:-1]], ends, strict=True)
+    ]
+    for rule in ("sensor", "ray"):
+        together, apart = (
+            tally([Observation(one.points, one.labels, poses, ends=ends)], rule),
+            tally(parts, rule),
+        )
+        assert (together.free == apart.free).all() and (together.occupied == apart.occupied).all()
+
+
+@pytest.mark.parametrize("ends", [None, [200], [200, 499], [600, 500]])
+def test_the_ends_of_voters_fit_poses_and_points(ends):
+    poses, one = np.stack([np.eye(4)] * 2), observation()
+    with pytest.raises(FormatError) as error:
+        Observation(one.points, one.labels, poses, ends=None if ends is None else np.array(ends))
+    assert error.value.where == "observation ends"
