@@ -24,6 +24,7 @@ from .core import GridSpec as GridSpec
 from .core import Remap as Remap
 from .core import Scan as Scan
 from .core import VoxelFlag as VoxelFlag
+from .dataset import Augment as Augment
 from .dataset import Dataset as Dataset
 from .dataset import Flip as Flip
 from .dataset import ShardSampler as ShardSampler

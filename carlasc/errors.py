@@ -14,10 +14,12 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from types import FrameType, ModuleType
-from typing import Any, Self, get_args
+from functools import cache
+from numbers import Integral, Real
+from types import FrameType, ModuleType, UnionType
+from typing import Any, Self, Union, get_args, get_origin, get_type_hints
 
 _USER = re.compile(r"(?<=://)[^/\s@'\"]+@")  # user:password
 # Characters that control a terminal or change the order of a line: control characters (ESC starts
@@ -209,6 +211,63 @@ def check_choice(name: str, value: object, choices: Any) -> None:
     allowed = get_args(choices) or tuple(choices)
     if value not in allowed:
         raise ArgumentError(name, expected=f"one of {', '.join(allowed)}", found=repr(value))
+
+
+_KIND_NAMES = {str: "a text", Integral: "a whole number", Real: "a number", type(None): "None"} | {
+    os.PathLike: "a path",
+    Callable: "a function",
+    Iterable: "several values",
+}
+# what is taken for a type
+_TAKEN: dict[Any, type] = {int: Integral, float: Real} | dict.fromkeys(
+    (tuple, list, frozenset, Sequence, Collection), Iterable
+)
+
+
+def check_types(function: Callable[..., object], arguments: Mapping[str, object]) -> None:
+    """Check the types of the arguments of a public function, as the first step of its body.
+
+    Truth values, the values of a `Literal`, and the contents of collections and arrays are not
+    checked.
+
+    Args:
+        function: the function, or the class of a dataclass.
+        arguments: `locals()`, or `vars(self)`.
+
+    Raises:
+        ArgumentError: an argument has none of the types of its annotation.
+    """
+    for name, kinds in _kinds_of(function).items():
+        value = arguments[name]
+        if not any(_is_a(value, kind) for kind in kinds):
+            shown = [kind for kind in kinds if kind is not str or os.PathLike not in kinds]
+            names = (_KIND_NAMES.get(kind, f"a {kind.__name__}") for kind in shown)
+            raise ArgumentError(name, expected=" or ".join(dict.fromkeys(names)), found=repr(value))
+
+
+def _is_a(value: object, kind: type) -> bool:
+    if isinstance(value, str) and kind is not str:
+        return False  # a text is not meant as a sequence of its letters
+    if isinstance(value, bool) and kind in (Integral, Real):
+        return False
+    return isinstance(value, kind)
+
+
+@cache
+def _kinds_of(function: Callable[..., object]) -> dict[str, list[type]]:
+    """Return the classes of the annotation of each argument that is checked."""
+    kinds: dict[str, list[type]] = {}
+    for name, hint in get_type_hints(function).items():
+        parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+        found = [get_origin(part) or part for part in parts]
+        if name != "return" and all(map(_is_checked, found)):
+            kinds[name] = [_TAKEN.get(kind, kind) for kind in found]
+    return kinds
+
+
+def _is_checked(kind: Any) -> bool:
+    is_class = isinstance(kind, type) and kind not in (bool, Any)
+    return is_class and not getattr(kind, "_is_protocol", False)
 
 
 def import_extra(module: str, extra: str) -> ModuleType:

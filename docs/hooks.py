@@ -27,11 +27,11 @@ from typer.models import ArgumentInfo, ParameterInfo
 
 from carlasc import cli
 from carlasc.cli.flags import flatten
-from carlasc.core.benchmarks import IGNORED, OCC3D, SSCBENCH, TO_OCC3D, TO_SSCBENCH
+from carlasc.core.benchmarks import IGNORED, TO_OCC3D, TO_SSCBENCH
 from carlasc.core.choices import Preset
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
-from carlasc.core.tables import CARLA, REMAPS, SEMANTICKITTI
+from carlasc.core.tables import CARLA, OCC3D, REMAPS, SEMANTICKITTI, SSCBENCH
 from carlasc.metrics import CONVENTIONS
 from carlasc.storage import layout
 

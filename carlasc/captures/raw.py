@@ -358,6 +358,13 @@ class Capture:
             name: np.frombuffer(data, np.uint8) for name, data in zip(names, files, strict=True)
         }
 
+    def files_of(self, frame: int) -> list[str]:
+        """Return the files of all sensors and cameras of a frame, as paths in the tree."""
+        arrays = [array_path(name, sensor, frame) for sensor in self.sensors for name in FOLDERS]
+        pictures = [bev_path(frame)] if self.has_bev(frame) else []
+        pictures += [image_path(name, frame) for name in self.image_fields(frame)]
+        return [self._folder + path for path in (*arrays, *pictures)]
+
     def light(self) -> Capture:
         """Return a copy without cached listings, to be sent to other processes with every frame."""
         return Capture(self.tree, self.classes)

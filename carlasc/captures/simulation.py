@@ -24,7 +24,7 @@ from carlasc.core.arrays import FloatArray, IntArray, Uint8Array
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import Transform
 from carlasc.core.tables import CARLA
-from carlasc.errors import ArgumentError, MissingDataError, check_choice
+from carlasc.errors import ArgumentError, MissingDataError, check_choice, check_types
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage.camera_files import cameras_to_json
@@ -234,6 +234,7 @@ def simulate(
         StorageError: `out` cannot be written to.
         CarlascError: a worker process died.
     """
+    check_types(simulate, locals())
     drive: Simulator = load_recorder(simulator, Simulator)(
         count=count,
         first_frame=first_frame,

@@ -5,9 +5,8 @@ code.
 from __future__ import annotations
 
 import copy
-import re
 import sys
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Container, Iterator
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -15,16 +14,22 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from carlasc.cli.common import FAILED, INTERRUPTED, WRONG_USAGE, BatchError, echo, fail
+from carlasc.cli.common import (
+    FAILED,
+    INTERRUPTED,
+    OPTIONS,
+    WRONG_USAGE,
+    BatchError,
+    as_typed,
+    echo,
+    fail,
+)
 from carlasc.cli.library import SEPARATOR
 from carlasc.errors import ArgumentError, CarlascError
 
 _INTERRUPTED = (
     "interrupted: files written so far are complete; run the same command again to continue"
 )
-# an argument in an error of the library: `workers`, `overwrite=True`
-_ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")
-_OPTIONS = re.compile(r"\w+Options\((.*)\)")  # the value of one: `poses=PoseOptions("kiss-icp")`
 _UsageError: Any = typer.BadParameter.__mro__[1]  # typer does not export it
 
 
@@ -132,6 +137,7 @@ def _errors_in_one_line(command: Any) -> Iterator[None]:
         typed = _typed(one)
         names = (one.name, one.name.rpartition(SEPARATOR)[2], typed.strip("-").replace("-", "_"))
         options |= dict.fromkeys(names, typed)
+    OPTIONS.set(options)
     try:
         yield
     except _UsageError as error:
@@ -143,12 +149,12 @@ def _errors_in_one_line(command: Any) -> Iterator[None]:
         if isinstance(error, ArgumentError):
             shown.where = options.get(error.where, error.where)
         fail(
-            _replace_arguments(str(shown), options),
+            as_typed(str(shown)),
             WRONG_USAGE if isinstance(error, ArgumentError) else FAILED,
         )
     except BatchError as error:
         for message in error.messages:
-            echo(f"carlasc: {_replace_arguments(message, options)}", err=True)
+            echo(f"carlasc: {as_typed(message)}", err=True)
         fail(str(error))
     except KeyboardInterrupt:
         fail(_INTERRUPTED, INTERRUPTED)
@@ -176,20 +182,3 @@ def _typed(parameter: Any) -> str:
     """Return what a user types for a parameter: `--frames`, or `SOURCE`."""
     longest: str = max(parameter.opts, key=len)
     return longest if longest.startswith("-") else (parameter.metavar or longest).upper()
-
-
-def _replace_arguments(text: str, options: Mapping[str, str]) -> str:
-    """Replace `` `window=8` `` by `` `--window 8` `` and `` `overwrite=True` `` by `` `--overwrite`
-    ``, if the command has such an option.
-    """
-
-    def replace(match: re.Match[str]) -> str:
-        name, value = match[1], match[2]
-        if name not in options:
-            return match[0]
-        if value in ("True", None):
-            return f"`{options[name]}`"
-        value = _OPTIONS.sub(r"\1", value).strip('"')
-        return f"`{options[name]} {value}`"
-
-    return _ARGUMENT.sub(replace, text)

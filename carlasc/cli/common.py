@@ -9,10 +9,12 @@ import json
 import re
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
@@ -27,6 +29,13 @@ _Number = TypeVar("_Number", int, float)
 
 _LINE_S = 10.0  # time between two lines of progress without a terminal, seconds
 FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
+
+OPTIONS: ContextVar[Mapping[str, str]] = ContextVar("OPTIONS", default=MappingProxyType({}))
+"""What a user types for each argument of the library that is an option of the running command."""
+
+# an argument in a message of the library: `workers`, `overwrite=True`
+_ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")
+_VALUES = re.compile(r"\w+Options\((.*)\)")  # the value of one: `poses=PoseOptions("kiss-icp")`
 
 # a URL, also with one slash only; a single letter is a drive
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
@@ -159,6 +168,31 @@ def report_failures(failures: Sequence[tuple[Any, str]], total: int, what: str =
         raise BatchError(summary, [message for _, message in failures])
 
 
+def as_typed(text: str) -> str:
+    """Replace `` `window=8` `` by `` `--window 8` `` and `` `overwrite=True` `` by `` `--overwrite`
+    ``, if the running command has such an option.
+    """
+    options = OPTIONS.get()
+
+    def replace(match: re.Match[str]) -> str:
+        name, value = match[1], match[2]
+        if name not in options:
+            return match[0]
+        if value in ("True", None):
+            return f"`{options[name]}`"
+        value = _VALUES.sub(r"\1", value).strip('"')
+        return f"`{options[name]} {value}`"
+
+    return _ARGUMENT.sub(replace, text)
+
+
+def print_warnings(findings: Iterable[Any]) -> None:
+    """Print what is probably wrong, a line each."""
+    for finding in findings:
+        if finding.severity == "warning":
+            echo(as_typed(f"warning: {finding}"))
+
+
 def print_frames(result: Any, places: Iterable[object], done: str, *, json: bool) -> None:
     """Print what a run made, as JSON or in lines, and end with exit code 1 if frames failed.
 
@@ -172,7 +206,7 @@ def print_frames(result: Any, places: Iterable[object], done: str, *, json: bool
         print_json(result)
     else:
         for note in result.notes:
-            echo(f"note: {note}")
+            echo(as_typed(f"note: {note}"))
         for place in places:
             echo(place)
         what, _, verb = done.rpartition(": ")

@@ -9,12 +9,15 @@ import typer
 
 import carlasc
 from carlasc.cli.common import (
+    BatchError,
     Json,
+    as_typed,
     echo,
     file_argument,
     place_argument,
     print_frames,
     print_json,
+    print_warnings,
     starting_with,
 )
 from carlasc.cli.flags import DeclaredOptions, RunFlags
@@ -50,15 +53,12 @@ def _print_preview(
             if one.up is None
             else f"height of the sensor above the ground: {one.height_m:g} m"
         )
-        wrong = one.up not in (None, "+z")
-        echo(
-            f"  {ground}"
-            + (f"; up is {one.up}, so the axes are not x forward, y left, z up" if wrong else "")
-        )
+        echo(f"  {ground}")
         estimated = "estimated from the scans with KISS-ICP"
         echo(f"  poses: {'those of the recording' if one.poses == 'file' else estimated}")
         for note in one.notes:
-            echo(f"  {note}")
+            echo(f"  {as_typed(note)}")
+        print_warnings(one.findings)
         echo(
             f"  output: {out}/{one.split}/{one.name}, with "
             f"{'no grids' if grids == 'none' else f'grids from {grids}'}"
@@ -129,6 +129,7 @@ def convert(
             source,
             sequences=chosen,
             **written.values,
+            layout=layout.make(),
             poses=poses.make(),
             options=options.values,
         )
@@ -136,6 +137,9 @@ def convert(
             print_json(previews)
         else:
             _print_preview(previews, out, grids)
+        found = [finding for one in previews for finding in one.findings]
+        if errors := [str(finding) for finding in found if finding.severity == "error"]:
+            raise BatchError("nothing would be converted", errors)
         return
     if making.is_given and grids != "scans":
         raise ArgumentError(
@@ -167,4 +171,6 @@ def convert(
             options=options.values,
             run=spread,
         )
+    if not json:
+        print_warnings(result.findings)
     print_frames(result, (*result.sequences, *result.grids), "converted", json=json)

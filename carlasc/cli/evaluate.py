@@ -86,6 +86,16 @@ class OutputFlags(Flags):
     as_json: Json = False
     latex: Annotated[bool, typer.Option("--latex", help="Print the tables as LaTeX.")] = False
     csv: Annotated[bool, typer.Option("--csv", help="Print the tables as CSV.")] = False
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as Markdown.")] = (
+        False
+    )
+
+    def texts(self, tables: Sequence[FigureTable]) -> str | None:
+        """Return tables in the chosen form; None for the terminal's."""
+        for form in ("latex", "csv", "markdown"):
+            if getattr(self, form):
+                return "\n".join(getattr(table, f"to_{form}")() for table in tables)
+        return None
 
 
 def evaluate(
@@ -99,7 +109,8 @@ def evaluate(
         str,
         place_argument(
             "Predictions: a data set, a sequence, the folder of a grid, a folder of .label files, "
-            "or files of SemanticKITTI, SSCBench, Occ3D, OpenOccupancy or CarlaOcc."
+            "or files of SemanticKITTI, SSCBench, Occ3D, OpenOccupancy, SurroundOcc, OccNet or "
+            "CarlaOcc."
         ),
     ],
     truth: Annotated[str, place_argument("Ground truth, in one of the same forms.", "TRUTH")],
@@ -107,7 +118,8 @@ def evaluate(
         str | None,
         typer.Option(
             help="Benchmark whose rules are followed: carlasc, semantickitti, sscbench, "
-            "occ3d-lidar, occ3d-lidar-sparseocc, occ3d-camera, openoccupancy; or own, which "
+            "occ3d-lidar, occ3d-lidar-sparseocc, occ3d-camera, openoccupancy, surroundocc, occnet; "
+            "or own, which "
             "scores the classes of the data. Default: the benchmark whose files TRUTH holds, "
             "otherwise carlasc, or own for classes that carlasc has no map for.",
             autocompletion=lambda incomplete: starting_with(
@@ -207,11 +219,8 @@ def evaluate(
 def _print_tables(tables: Sequence[FigureTable], remark: str, output: OutputFlags) -> None:
     from carlasc.cli.tables import print_table
 
-    if output.latex or output.csv:
-        echo(
-            "\n".join(table.to_latex() if output.latex else table.to_csv() for table in tables),
-            nl=False,
-        )
+    if (text := output.texts(tables)) is not None:
+        echo(text, nl=False)
         return
     for table in tables:
         print_table(table.header, table.texts(), title=f"{table.title} ({remark})")
@@ -225,12 +234,21 @@ def _print(result: Evaluation, other: Evaluation | None, output: OutputFlags) ->
             values["comparison"] = {"with": other.name, **comparison.to_dict()}
         print_json(values)
         return
-    _print_tables(
-        result.tables(),
-        f"percent, {count(result.frames, 'frame')}, voxels: {result.voxels}",
-        output,
+    for kind, part in {"": result, **result.apart}.items():
+        of = f"{kind} grids, " if kind else ""
+        remark = f"{of}percent, {count(part.frames, 'frame')}, voxels: {part.voxels}"
+        _print_tables(part.tables(), remark, output)
+    predicted, true = (
+        ", ".join(map(str, uses)) for uses in (result.source_classes, result.truth_classes)
     )
-    if output.latex or output.csv:
+    remarks = [f"classes: predictions {predicted}; ground truth {true}"]
+    remarks += [text for part in (result, *result.apart.values()) if (text := part.about_absent())]
+    for remark in remarks:
+        if output.texts([]) is None:
+            show(remark)
+        else:
+            echo(remark, err=True)
+    if output.texts([]) is not None:
         return
     if (interval := result.interval()) is not None:
         show(

@@ -72,6 +72,10 @@ def _print(overview: Overview) -> None:
             "Made",
         )
         print_table(header, [_grid_row(grids) for grids in kinds])
+    for sequence in overview.sequences:
+        for grid in sequence.grids:
+            if grid.stale:
+                show(f"{sequence.path or sequence.name}/{grid.name}: stale: {grid.stale}", "yellow")
     for capture in overview.captures:
         span = f"{capture.first}..{capture.last}" + (
             f" with {count(capture.gaps, 'gap')}" if capture.gaps else ""

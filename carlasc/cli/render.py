@@ -80,4 +80,6 @@ def render(
     if result.legend is not None:
         echo(f"{result.legend}: the legend")
     shown = f"{content} of {result.sequence}, {describe_frames(result.frames)}"
+    if result.source_classes is not None:
+        shown += f", classes {result.source_classes}"
     echo(f"{result.out}: {shown}, {result.size[0]} x {result.size[1]}")

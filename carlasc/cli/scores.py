@@ -17,7 +17,7 @@ def scores(
         list[Path], typer.Argument(help="JSON files that `carlasc evaluate --json` printed.")
     ],
     format: Annotated[
-        Literal["text", "markdown", "latex", "html"] | None,
+        Literal["text", "markdown", "latex", "csv", "html"] | None,
         typer.Option(help="Format of the table. Default: by the ending of OUT, otherwise text."),
     ] = None,
     out: Annotated[
@@ -32,15 +32,14 @@ def scores(
     table = options.make(files)
     if format is None and out is not None:
         endings = {".md": "markdown", ".tex": "latex", ".html": "html", ".htm": "html"}
-        format = endings.get(out.suffix.lower(), "text")  # type: ignore[assignment]
-    plain = format in (None, "text")
-    if plain and out is None:
+        format = endings.get(out.suffix.lower(), "csv")  # type: ignore[assignment]
+    if format in (None, "text") and out is None:
         from carlasc.cli.tables import print_table
 
         figures = table.table()
         print_table(figures.header, figures.texts(), title=figures.title)
         return
-    text = table.table().to_csv() if plain else getattr(table, f"to_{format}")()
+    text = getattr(table, f"to_{'csv' if format == 'text' else format}")()
     if out is None:
         echo(text, nl=False)
         return

@@ -74,6 +74,7 @@ def stats(
 def print_statistics(result: Statistics, by: str = "split") -> None:
     """Print the class tables; `carlasc demo` uses it too."""
     from carlasc.cli.tables import print_table
+    from carlasc.core.classes import times
 
     splits = result.by_split() if by == "split" else {}
     if set(splits) == {"none"}:
@@ -87,6 +88,10 @@ def print_statistics(result: Statistics, by: str = "split") -> None:
             header, rows = _sequence_table(result, kind)
             print_table(header, rows, title=f"{kind}, % by sequence")
     total = result.total
+    show(f"classes: {', '.join(map(str, result.uses))}")
+    if total.unlisted:
+        ids = times(dict(sorted(total.unlisted.items())))
+        show(f"points and voxels of ids that are no class, in no row: {ids}")
     if total.grids:
         show(f"{total.known_share:.1%} of voxels known ({count(total.grids, 'grid')})")
         show("voxels % is of the known voxels; class 0 of points is unlabelled")

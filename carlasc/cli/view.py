@@ -83,4 +83,5 @@ def view(
         "": "serve it with `python -m http.server`",
     }
     advice = opened.get(out.suffix.lower(), "open it in a browser")
-    echo(f"{result.out}: {result.sequence}, {describe_frames(result.frames)}, {size}: {advice}")
+    about = f"{describe_frames(result.frames)}, classes {result.source_classes}, {size}"
+    echo(f"{result.out}: {result.sequence}, {about}: {advice}")

@@ -59,7 +59,8 @@ Fields = Mapping[str, AnyArray]
 Velocity = tuple[float, float, float]
 """(vx, vy, vz) in m/s over ground, right-handed sensor frame."""
 
-_MAX_GAP = 10  # frames for which an actor may be hidden; a new path begins after a longer gap
+MAX_GAP = 10
+"""Frames for which an actor may be hidden; a new path begins after a longer gap."""
 _MAX_OBSERVATIONS = 400  # of one path
 _MAX_POINTS = 1000  # of one observation
 _FARTHEST_M = 1e4  # points farther than any LiDAR measures are damaged, as infinity and NaN are
@@ -202,7 +203,7 @@ class ActorMotion:
             chain = self._chains.get(observation.actor)
             if (
                 chain is None
-                or frame - chain.frames[-1] > _MAX_GAP
+                or frame - chain.frames[-1] > MAX_GAP
                 or len(chain.frames) >= _MAX_OBSERVATIONS
             ):
                 self._ended += [] if chain is None else [chain]
@@ -213,7 +214,7 @@ class ActorMotion:
             chain.poses.append(first_T_sensor)
             chain.points.append(observation.points)
         for actor in [
-            actor for actor, chain in self._chains.items() if frame - chain.frames[-1] > _MAX_GAP
+            actor for actor, chain in self._chains.items() if frame - chain.frames[-1] > MAX_GAP
         ]:
             self._ended.append(self._chains.pop(actor))
         if len(self._ended) >= _BATCH:
@@ -252,6 +253,7 @@ class MotionJob:
         nearby: the labelled frames before and after it, if it has no labels and others have.
         labelled: whether its points have labels in the data set. Those that an interrupted run made
             from boxes are made again.
+        own: names of the fields that this run read of it in the data set; None if it read none.
     """
 
     handle: FrameHandle
@@ -262,6 +264,7 @@ class MotionJob:
     boxes: Boxes | None = None
     nearby: tuple[MotionJob, ...] = ()
     labelled: bool = True
+    own: frozenset[str] | None = None
 
 
 @dataclass(frozen=True)
@@ -289,7 +292,11 @@ class MotionStage:
         the data set.
         """
         number, writer = job.handle.number, self.writer
-        wanted = [name for name in names if job.labelled or name != "labels"]
+        wanted = [
+            name
+            for name in names
+            if (job.labelled or name != "labels") and (not job.own or name in job.own)
+        ]
         written = {name: writer.read(name, number) for name in wanted if writer.has(name, number)}
         if writer.has("points", number) and all(array is not None for array in written.values()):
             return {name: array for name, array in written.items() if array is not None}

@@ -10,7 +10,15 @@ from functools import lru_cache
 
 import numpy as np
 
-from carlasc.converting.protocol import Cloud, Converter, FrameHandle, Sensor, Trajectory
+from carlasc.converting.plausibility import check_scan
+from carlasc.converting.protocol import (
+    Cloud,
+    Converter,
+    FrameHandle,
+    Recording,
+    Sensor,
+    Trajectory,
+)
 from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, LabelArray, Uint32Array
 from carlasc.core.choices import Axes
 from carlasc.core.choices import FlowSource as FlowSource  # noqa: PLC0414 (part of this module)
@@ -22,6 +30,7 @@ from carlasc.errors import (
     CarlascError,
     FormatError,
     check_choice,
+    check_types,
     describe,
     first_names,
 )
@@ -48,6 +57,8 @@ class LayoutOptions:
         allow_unknown: treat class ids that the table does not have as unlabelled.
         images: images of cameras. "copy": copied into the output. "link": only their paths are
             written. "none": left out. The calibration of the cameras is always written.
+        level: turn scans upright, so that the ground in them is level: for a LiDAR that is mounted
+            upside down or at an angle, without a calibration that says so.
 
     Raises:
         ArgumentError: an unknown value of `axes`, `flow` or `images`.
@@ -58,8 +69,10 @@ class LayoutOptions:
     flow: FlowSource = "auto"
     allow_unknown: bool = False
     images: Images = "none"
+    level: bool = False
 
     def __post_init__(self) -> None:
+        check_types(LayoutOptions, vars(self))
         check_choice("axes", self.axes, Axes)
         check_choice("images", self.images, Images)
         check_choice("flow", self.flow, FlowSource)
@@ -149,10 +162,17 @@ class Rig:
     Attributes:
         sensors: the LiDARs.
         vehicle_T_scan: (4, 4), from the frame of the scans in the layout to that of the vehicle.
+        rays: whether points are those that a sensor at the origin sees.
     """
 
     sensors: tuple[Sensor, ...]
     vehicle_T_scan: Transform
+    rays: bool = True
+
+    @classmethod
+    def of(cls, recording: Recording) -> Rig:
+        """Return the sensors of a recording."""
+        return cls(tuple(recording.sensors), recording.vehicle_T_scan, recording.rays)
 
     @property
     def needs_motion(self) -> bool:
@@ -191,7 +211,7 @@ class Assembled:
 
 
 def read_scan(handle: FrameHandle, rig: Rig, motion: VehicleMotion | None) -> Assembled:
-    """Read a frame, and put its clouds together as `assemble` does.
+    """Read a frame, put its clouds together as `assemble` does, and check the scan.
 
     Args:
         handle: the frame.
@@ -199,8 +219,8 @@ def read_scan(handle: FrameHandle, rig: Rig, motion: VehicleMotion | None) -> As
         motion: the motion of the vehicle around the frame; None if it is not known.
 
     Raises:
-        CarlascError: the frame cannot be read. Other exceptions of a converter become a
-            FormatError.
+        CarlascError: the frame cannot be read, or is no scan. Other exceptions of a converter
+            become a FormatError.
     """
     try:
         clouds = handle.read()
@@ -212,7 +232,10 @@ def read_scan(handle: FrameHandle, rig: Rig, motion: VehicleMotion | None) -> As
             "check the file, or report the error",
         )
         raise FormatError(handle.location, problem=problem, advice=advice) from error
-    return assemble(clouds, rig, motion, handle.location)
+    scan = assemble(clouds, rig, motion, handle.location)
+    if rig.rays:
+        check_scan(scan.points, scan.fields.get("seconds"), handle.location)
+    return scan
 
 
 def assemble(

@@ -22,9 +22,19 @@ from carlasc.converting.exporter import (
 from carlasc.converting.protocol import Failure, check_outside
 from carlasc.converting.registry import load_exporter, read_options
 from carlasc.core.arrays import AnyArray
-from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError, StorageError
+from carlasc.core.choices import CompareInputs
+from carlasc.errors import (
+    CarlascError,
+    ConflictError,
+    FormatError,
+    MissingDataError,
+    StorageError,
+    check_choice,
+    check_types,
+)
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Part, Run, StepCounter
+from carlasc.storage import layout
 from carlasc.storage.files import (
     AnyPath,
     has_content,
@@ -36,6 +46,15 @@ from carlasc.storage.files import (
     to_json,
     write_atomic,
     write_many,
+)
+from carlasc.storage.folder import FolderWriter
+from carlasc.storage.inputs import (
+    MadeFrom,
+    SequenceFiles,
+    combined,
+    content_digests,
+    describe_changes,
+    made_again,
 )
 
 RECORD = "carlasc-export.json"
@@ -74,13 +93,15 @@ def export(
     sequences: Collection[str] | None = None,
     overwrite: bool = False,
     options: Mapping[str, Any] | None = None,
+    compare_inputs: CompareInputs = "fast",
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> ExportResult:
     """Write sequences of the layout in the format of another data set, so that its tools can read
     them.
 
     A second run skips existing frames; if a format has one file per sequence, it skips complete
-    sequences. A frame that cannot be written is reported in the result, and the others are written.
+    sequences. A sequence that changed since then is exported again. A frame that cannot be written
+    is reported in the result, and the others are written.
 
     Args:
         name: the other data set: one of `exporter_names()`.
@@ -90,6 +111,9 @@ def export(
         overwrite: write existing frames again.
         options: options of the exporter, by name, such as `{"grid": "evaluation"}`; text is parsed
             as the type of the option (see `option_declarations`).
+        compare_inputs: how it is found out whether a sequence changed: "fast": by the size and the
+            time of each file, and by content where these differ; "content": by content; "never":
+            existing frames are kept.
         run: how the work is spread. A part exports a share of the frames, or of the sequences if
             each is one file. The last part to finish writes the files that belong to no single
             sequence.
@@ -104,7 +128,9 @@ def export(
             other options.
         StorageError: the output cannot be written. The files written so far are complete.
     """
+    check_types(export, locals())
     start = time.perf_counter()
+    check_choice("compare_inputs", compare_inputs, CompareInputs)
     kind = load_exporter(name)
     exporter = kind(**read_options(kind, options))
     root = Path(out)
@@ -135,7 +161,21 @@ def export(
     with one_pool(run) as pooled:
         writing = _SequenceExport(exporter, root, overwrite, pooled, steps)
         for exported in ours:
-            writing.add(exported)
+            label = f"export-{name}-{exporter.product}/{_place(exporter, exported)}"
+            inputs = _ExportedFrom(exporter, root, label, exported, compare_inputs, pooled)
+            again = inputs.changed and any(
+                _exists(exporter, exported.sequence, frame, root / exported.folder)
+                for frame in exported.frames
+            )
+            if again:
+                notes.append(f"{root / exported.folder}: {inputs.why(exported)}")
+                inputs.remove_gone()
+            else:
+                inputs.write()
+            failed = len(writing.failures)
+            writing.add(exported, again=again)
+            if len(writing.failures) == failed:  # otherwise, frames of before may still be there
+                inputs.write()
     if run.part.count == 1 or all(
         _is_whole(exporter, exported, root / exported.folder) for exported in chosen
     ):
@@ -227,9 +267,80 @@ def _is_whole(exporter: Exporter, exported: Exported, folder: Path) -> bool:
     return all(_exists(exporter, sequence, frame, folder) for frame in exported.frames)
 
 
-def _exists(exporter: FrameExporter, sequence: storage.Sequence, frame: int, folder: Path) -> bool:
-    """Whether all files of a frame exist."""
-    return all(has_content(folder / file) for file in exporter.frame_files(sequence, frame))
+def _exists(exporter: Exporter, sequence: storage.Sequence, frame: int, folder: Path) -> bool:
+    """Whether all files of a frame exist, or the file of its sequence."""
+    files = (
+        exporter.frame_files(sequence, frame)
+        if isinstance(exporter, FrameExporter)
+        else (exporter.file(sequence),)
+        if isinstance(exporter, SequenceExporter)
+        else ()
+    )
+    return all(has_content(folder / file) for file in files)
+
+
+class _ExportedFrom:
+    """The record of what a sequence was exported from. A frame may depend on all of the sequence.
+
+    Attributes:
+        changed: whether the sequence is not known to be what it was.
+    """
+
+    def __init__(
+        self,
+        exporter: Exporter,
+        root: Path,
+        label: str,
+        exported: Exported,
+        compare: CompareInputs,
+        run: Run,
+    ) -> None:
+        self._exporter, self._sequence = exporter, exported.sequence
+        self._folder, self._writer = root / exported.folder, FolderWriter(root)
+        self._label = f"{label}-{run.part.number}-of-{run.part.count}"
+        self._before = MadeFrom.read(self._writer, self._label)
+        self._now: MadeFrom | None = None
+        self.changed = False
+        if compare != "never":
+            sequence = self._sequence
+            files = SequenceFiles(sequence, *sequence.fields())
+            files.kind = self._label
+            contents = content_digests(files, exported.frames, self._writer, compare, run)
+            own = {str(frame): content for frame, content in contents.items()}
+            texts = [
+                (text, sequence.read_document(text))
+                for text in sequence.documents()
+                if not text.endswith(layout.REPORT)
+            ]
+            whole = combined(sorted(own.items()), texts)
+            written = {str(frame): self._files(frame) for frame in exported.frames}
+            self._now = MadeFrom(whole, own, written)
+            self.changed = self._before.whole != whole
+
+    def why(self, exported: Exported) -> str:
+        """Return why the sequence is exported again."""
+        own = {} if self._now is None else self._now.own
+        why = describe_changes(self._before.own, own) or "texts or settings changed"
+        return made_again(exported.frames, why if self._before.whole else "there was no record")
+
+    def _files(self, frame: int) -> str:
+        """Return the files of a frame, separated by line breaks."""
+        if isinstance(self._exporter, FrameExporter):
+            return "\n".join(self._exporter.frame_files(self._sequence, frame))
+        return ""
+
+    def remove_gone(self) -> None:
+        """Remove the files of frames that the sequence has no longer."""
+        left = set(self._exporter.frames(self._sequence))
+        for frame, files in self._before.frames.items():
+            if int(frame) not in left:
+                for file in files.splitlines():
+                    (self._folder / file).unlink(missing_ok=True)
+
+    def write(self) -> None:
+        """Write the record."""
+        if self._now is not None:
+            self._now.write(self._writer, self._label)
 
 
 @dataclass(frozen=True)
@@ -265,9 +376,11 @@ class _SequenceExport:
     exported: list[Exported] = field(default_factory=list)
     skipped: int = 0
     failures: list[Failure] = field(default_factory=list)
+    _again: bool = False
 
-    def add(self, exported: Exported) -> None:
-        """Export the frames of a sequence."""
+    def add(self, exported: Exported, *, again: bool = False) -> None:
+        """Export the frames of a sequence; with `again`, also those that exist."""
+        self._again = again or self.overwrite
         sequence, folder = exported.sequence, self.root / exported.folder
         remove_stale(folder)
         documents = self.exporter.documents(sequence)
@@ -290,7 +403,7 @@ class _SequenceExport:
         jobs = [
             ExportJob(exporter, sequence, frame, folder)
             for frame in exported.frames
-            if self.overwrite or not _exists(exporter, sequence, frame, folder)
+            if self._again or not _exists(exporter, sequence, frame, folder)
         ]
         self._skip(len(exported.frames) - len(jobs))
         failures = {}
@@ -309,7 +422,7 @@ class _SequenceExport:
         """
         exporter, sequence = self.exporter, exported.sequence
         assert isinstance(exporter, SequenceExporter)
-        if not self.overwrite and _is_whole(exporter, exported, folder):
+        if not self._again and _is_whole(exporter, exported, folder):
             self._skip(len(exported.frames))
             return {}
         path = folder / exporter.file(sequence)

@@ -9,21 +9,39 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from carlasc.converting.assembling import AxesAndClasses, Rig, VehicleMotion, read_scan
+from carlasc.converting.chosen import ChosenFrames
+from carlasc.converting.plausibility import (
+    POSE_S,
+    Mount,
+    ScanCentres,
+    are_posed,
+    check_mount,
+    check_scan,
+    find_mount,
+)
 from carlasc.converting.protocol import Converter, FrameHandle, Recording, Trajectory
-from carlasc.core.arrays import FloatArray
+from carlasc.core.arrays import Float32Array, FloatArray, IntArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.choices import SplitName as SplitName  # noqa: PLC0414 (part of this module)
-from carlasc.core.frames import check_seconds
+from carlasc.core.frames import FrameRange, check_seconds
 from carlasc.core.geometry import invert, mirror_poses, relative_to
 from carlasc.core.grids import GridSpec, mirror_spec
-from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError
-from carlasc.inspection.alignment import diagnose_poses, structure_of
-from carlasc.inspection.pose_quality import describe_mounting
+from carlasc.errors import (
+    ArgumentError,
+    CarlascError,
+    ConflictError,
+    FormatError,
+    MissingDataError,
+    first_names,
+)
+from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses, structure_of
+from carlasc.inspection.findings import Finding
+from carlasc.inspection.pose_quality import describe_jumps, describe_mounting
 from carlasc.motion.options import PoseOptions
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
@@ -42,6 +60,7 @@ _ACCEPT = "accept them as they are with `force=True`"
 # fourth differences, which are nearly 0 for a vehicle
 _SMOOTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 _JITTER_M = 0.05
+_SCANS = 5  # scans that say how the sensor is mounted
 _AROUND_S = 1.0  # part of the trajectory that a frame needs: longer than a sweep
 
 
@@ -61,9 +80,13 @@ class RecordingPlan:
         flow: whether flow is written.
         voxels: geometry of the recording's own voxel grids, right-handed, if they are written.
         notes: notes for the user on poses and times, one line each.
+        findings: what is probably wrong.
+        force: whether estimated poses are not checked.
         missing: numbers of the frames whose scan is not written yet.
         unfinished: numbers of the frames without a scan, or without the fields from the motion of
             actors.
+        again: whether all frames are made again and compared with those in the output, because the
+            data set changed.
     """
 
     recording: Recording
@@ -76,8 +99,16 @@ class RecordingPlan:
     flow: bool
     voxels: GridSpec | None = None
     notes: list[str] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+    force: bool = False
     missing: set[int] = field(default_factory=set)
     unfinished: set[int] = field(default_factory=set)
+    again: bool = False
+
+    def make_again(self) -> None:
+        """Make all frames again, because the data set changed."""
+        numbers = {handle.number for handle in self.recording.frames}
+        self.again, self.missing, self.unfinished = True, numbers, set(numbers)
 
     def take_estimate(self, first_T_scan: FloatArray) -> None:
         """Take estimated poses, (F, 4, 4) by frame number."""
@@ -87,9 +118,14 @@ class RecordingPlan:
         )
 
     @property
+    def checked(self) -> str | None:
+        """The recording, for errors of its estimated poses; None if these are not checked."""
+        return None if self.force else self.recording.location
+
+    @property
     def rig(self) -> Rig:
         """The sensors."""
-        return Rig(tuple(self.recording.sensors), self.recording.vehicle_T_scan)
+        return Rig.of(self.recording)
 
     @property
     def added(self) -> tuple[str, ...]:
@@ -180,6 +216,183 @@ def sequence_path(recording: Recording) -> str:
     return f"{recording.split}/{recording.name}/cartesian"
 
 
+@dataclass(frozen=True)
+class Examined:
+    """What is known of a recording before it is converted.
+
+    Attributes:
+        recording: the recording, with the frames that are converted, and upright.
+        times: (F,) seconds by frame number, by its clock.
+        has_times: whether the recording has times.
+        trajectory: poses of the vehicle by the same clock; None if they must be estimated.
+        poses: (F, 4, 4) first_T_scan by frame number; None if they must be estimated.
+        mount: how the sensor is mounted; None if no ground was found.
+        notes: notes for the user, one line each.
+        findings: what is probably wrong ("warning"), and what stops a conversion ("error").
+    """
+
+    recording: Recording
+    times: FloatArray
+    has_times: bool
+    trajectory: Trajectory | None
+    poses: FloatArray | None
+    mount: Mount | None
+    notes: list[str]
+    findings: list[Finding]
+
+
+def examine(
+    recording: Recording,
+    converter: Converter,
+    options: PoseOptions,
+    *,
+    frames: FrameRange,
+    level: bool,
+    known: bool,
+) -> Examined:
+    """Read the poses and times of a recording, choose its frames, and check what can be checked
+    before they are read.
+
+    Args:
+        recording: the recording.
+        converter: the converter.
+        options: where poses come from.
+        frames: the frames to convert.
+        level: whether scans are turned upright.
+        known: whether poses and mount are accepted without a check, for which scans are read.
+
+    Raises:
+        ArgumentError: `frames` holds no frame.
+        FormatError: poses or times are not valid, or belong to other times than the scans.
+        MissingDataError: the recording has no poses, although they were requested.
+    """
+    notes, findings = list[str | None](), list[Finding]()
+    checked = recording.rays and (level or not known)
+    mount = find_mount(_some_scans(recording)) if checked else None
+    if level and mount is not None:
+        recording = _upright(recording, converter, mount, options)
+        notes.append(f"scans were turned upright: they show {mount}")
+    else:
+        findings += check_mount(mount, recording.location, force=False)
+    own_times = recording.times()
+    times = frame_times(recording, own_times)
+    trajectory = read_trajectory(recording, options)
+    chosen = [handle for handle in recording.frames if handle.number in frames]
+    if not chosen:
+        raise ArgumentError(
+            "frames",
+            expected=f"frames of {recording.location}: {recording.frames[0].number} to "
+            f"{recording.frames[-1].number}",
+            found=str(frames),
+        )
+    if trajectory is not None and trajectory.seconds is not None:
+        numbers = np.array([handle.number for handle in chosen])
+        posed = are_posed(times[numbers], trajectory.seconds)
+        if not posed.all():
+            first, last = times[numbers[[0, -1]]]
+            begin_s, end_s = trajectory.seconds[[0, -1]]
+            if not posed.any():
+                raise FormatError(
+                    trajectory.where,
+                    expected=f"poses over the time of the scans, {first:.3f} to {last:.3f} s",
+                    found=f"poses over {begin_s:.3f} to {end_s:.3f} s",
+                    advice=f"check that both use the same clock, or {_ESTIMATE}",
+                )
+            chosen = [handle for handle, there in zip(chosen, posed, strict=True) if there]
+            notes.append(
+                f"{np.count_nonzero(~posed)} of {len(posed)} scans have no pose at their time, and "
+                f"are left out: {_ranges(numbers[~posed])}"
+            )
+    if len(chosen) < len(recording.frames):
+        recording = ChosenFrames(recording, chosen)
+    poses, last = None, chosen[-1].number + 1
+    if trajectory is not None:
+        poses = scan_poses(trajectory, recording, times)[:last]
+        if trajectory.seconds is None:
+            trajectory = at_frames(trajectory.world_T_vehicle, times)
+    times = times[:last]
+    if not recording.rays:
+        notes.append("the positions of the sensor are not known, so no grids are made from scans")
+    elif poses is None:
+        why = "as requested" if options.source == KISS_ICP else "because the recording has none"
+        notes.append(f"poses are estimated from the scans with KISS-ICP, {why}")
+    else:
+        if not known:
+            try:
+                notes.append(check_poses(recording, converter, poses))
+            except FormatError as error:
+                findings.append(Finding.from_error("poses-on-scans", recording.location, error))
+        numbers = np.array([handle.number for handle in chosen])
+        if jump := describe_jumps(numbers, poses[numbers], times[numbers]):
+            advice = f"check whether the poses belong to these scans, or {_ESTIMATE}"
+            expected = "poses without jumps"
+            findings.append(
+                Finding("warning", "pose-jump", recording.location, expected, jump, advice)
+            )
+        notes.append(jitter_note(poses))
+    if own_times is None and recording.rays:
+        notes.append("there are no times: frames are taken to be 0.1 s apart")
+    said = [note for note in notes if note]
+    return Examined(
+        recording, times, own_times is not None, trajectory, poses, mount, said, findings
+    )
+
+
+def _ranges(numbers: IntArray) -> str:
+    """Return some increasing numbers as ranges: "0 to 3, 7"."""
+    parts = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
+    return first_names(
+        f"{part[0]} to {part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts
+    )
+
+
+def _some_scans(recording: Recording) -> list[Float32Array]:
+    """Return the points of some scans of a recording that can be read.
+
+    Raises:
+        FormatError: none of them is a scan: the error of the first one.
+    """
+    rig, scans, frames = (
+        replace(Rig.of(recording), rays=False),
+        list[Float32Array](),
+        recording.frames,
+    )
+    problem: FormatError | None = None
+    for row in sorted({*np.linspace(0, len(frames) - 1, _SCANS).astype(int).tolist()}):
+        with suppress(CarlascError, OSError):  # the conversion of the frame reports the error
+            scan = read_scan(frames[row], rig, None)
+            try:
+                check_scan(scan.points, scan.fields.get("seconds"), frames[row].location)
+                scans.append(scan.points)
+            except FormatError as error:
+                problem = problem or error
+    if problem is not None and not scans:
+        raise problem
+    return scans
+
+
+def _upright(
+    recording: Recording, converter: Converter, mount: Mount, options: PoseOptions
+) -> Recording:
+    """Return a recording with its scans turned upright.
+
+    Its poses are those of the tilted sensor, or of a vehicle that is level, whatever lets scans
+    overlap more.
+    """
+    frames, turn = recording.frames, mount.level_T_scan
+    choices = [
+        ChosenFrames(recording, frames, turn, vehicle_is_level=level) for level in (False, True)
+    ]
+    times, shares = frame_times(recording, recording.times()), list[float]()
+    for choice in choices:
+        trajectory = read_trajectory(choice, options)
+        if trajectory is None:
+            return choice
+        diagnosis = _diagnose(choice, converter, scan_poses(trajectory, choice, times))
+        shares.append(diagnosis.share if diagnosis.pairs else 0.0)
+    return choices[shares[1] > shares[0]]
+
+
 def plan_recording(
     recording: Recording,
     converter: Converter,
@@ -187,6 +400,8 @@ def plan_recording(
     target: AxesAndClasses,
     options: PoseOptions,
     *,
+    frames: FrameRange = FrameRange(),  # noqa: B008 (frozen)
+    level: bool = False,
     flow: bool,
     voxels: bool,
 ) -> RecordingPlan:
@@ -199,43 +414,42 @@ def plan_recording(
         sink: the output.
         target: the axes and classes of the output.
         options: where poses come from.
+        frames: the frames to convert.
+        level: whether scans are turned upright.
         flow: whether flow is written, if it is available.
         voxels: whether the recording's own voxel grids are written.
 
     Raises:
-        FormatError: poses, times or boxes are not valid, or scans do not overlap under the poses.
+        FormatError: poses, times or boxes are not valid, scans do not overlap under the poses, or
+            their sensor is not upright.
         MissingDataError: the recording has no poses or voxels, although they were requested.
         ConflictError: the output has another grid in the place of the voxels.
     """
     writer = sink.sequence(sequence_path(recording))
-    own_times = recording.times()
-    times = frame_times(recording, own_times)
-    trajectory = read_trajectory(recording, times, options)
-    poses = None if trajectory is None else scan_poses(trajectory, recording, times)
-    notes: list[str | None] = []
-    if not recording.rays:
-        notes.append("the positions of the sensor are not known, so no grids are made from scans")
-    elif poses is None:
-        why = "as requested" if options.source == KISS_ICP else "because the recording has none"
-        notes.append(f"poses were estimated from the scans with KISS-ICP, {why}")
-    else:
-        if not options.force and writer.read_document(layout.POSES) is None:
-            notes.append(check_poses(recording, converter, poses))
-        notes.append(jitter_note(poses))
-    if own_times is None and recording.rays:
-        notes.append("there are no times: frames are taken to be 0.1 s apart")
+    known = options.force or writer.read_document(layout.POSES) is not None
+    seen = examine(recording, converter, options, frames=frames, level=level, known=known)
+    if problem := next((one for one in seen.findings if one.severity == "error"), None):
+        raise FormatError(
+            problem.location,
+            expected=problem.expected,
+            found=problem.found,
+            advice=problem.advice,
+        )
+    recording = seen.recording
     boxes = _read_boxes(recording)
     plan = RecordingPlan(
         recording,
         writer,
-        times,
-        trajectory,
-        poses,
-        KISS_ICP if trajectory is None else FILE,
+        seen.times,
+        seen.trajectory,
+        seen.poses,
+        KISS_ICP if seen.trajectory is None else FILE,
         boxes,
         flow and (boxes is not None or (recording.has_labels and recording.has_instances)),
         _check_voxels(recording, writer, target) if voxels else None,
-        [note for note in notes if note],
+        seen.notes,
+        seen.findings,
+        force=options.force,
     )
     for handle in recording.frames:
         if not writer.has("points", handle.number):
@@ -326,6 +540,8 @@ def begin(plan: RecordingPlan, target: AxesAndClasses, metadata: Metadata) -> No
         "poses": plan.pose_source,
         "sensors": _sensors(plan, target),
     }
+    if plan.findings:
+        extra["findings"] = _recorded(plan.findings)
     if plan.boxes is not None and not plan.recording.has_labels:
         extra["labels"] = "boxes"
     if not plan.recording.rays:
@@ -340,15 +556,26 @@ def begin(plan: RecordingPlan, target: AxesAndClasses, metadata: Metadata) -> No
             found=str(before.extra.get("poses", "others")),
             advice="write to another place",
         )
+    if before is not None and _places(before.extra) not in ([], _places(extra)):
+        raise ConflictError(
+            where,
+            expected="the sensors at the places, and as level, as in this run",
+            found="others",
+            advice="give the same `level`, or write to another place",
+        )
     _announce(plan)
-    documents = {layout.METADATA: agree_metadata(writer, replace(metadata, extra=extra))}
+    described = replace(metadata, extra=extra)
+    documents = {layout.METADATA: agree_metadata(writer, described)}
+    if plan.again and existing is not None:
+        documents[layout.METADATA] = described.to_json()
     documents[layout.TIMES] = agree_lines(writer, layout.TIMES, plan.times - plan.times[0])
     if plan.voxels is not None:
         documents[layout.params_file(layout.grid_folder(plan.voxels))] = to_json(
             _voxel_params(plan.voxels, target)
         )
     _write(plan, documents)
-    estimated = writer.read_document(layout.POSES) if plan.poses is None else None
+    is_known = plan.poses is None and not plan.again
+    estimated = writer.read_document(layout.POSES) if is_known else None
     if estimated is not None:
         stored = layout.decode_poses(estimated, f"{writer.location}/{layout.POSES}")
         plan.take_estimate(mirror_poses(stored) if target.mirrored else stored)
@@ -364,20 +591,40 @@ def write_poses(plan: RecordingPlan, target: AxesAndClasses) -> None:
     """
     assert plan.poses is not None
     poses = mirror_poses(plan.poses) if target.mirrored else plan.poses
-    _write(plan, {layout.POSES: agree_lines(plan.writer, layout.POSES, poses)})
+    if plan.again and plan.pose_source == KISS_ICP:
+        _write(plan, {layout.POSES: layout.encode_poses(poses)})
+    else:
+        _write(plan, {layout.POSES: agree_lines(plan.writer, layout.POSES, poses)})
 
 
-def write_heights(plan: RecordingPlan, height_m: float) -> None:
-    """Add the height of the first sensor above the ground to carlasc.json, if it is not known."""
+def _places(extra: Mapping[str, Any]) -> list[object]:
+    return [
+        np.round(sensor.get("scan_T_sensor", ()), 3).tolist() for sensor in extra.get("sensors", [])
+    ]
+
+
+def _recorded(findings: Iterable[Finding]) -> list[dict[str, str]]:
+    """Return the record of findings in carlasc.json."""
+    return [{"check": one.check, "verdict": one.severity, "message": str(one)} for one in findings]
+
+
+def write_found(plan: RecordingPlan, height_m: float | None) -> None:
+    """Add what was found while scans were read to carlasc.json: the height of the first sensor
+    above the ground, if it is not known, and findings.
+    """
     data = plan.writer.read_document(layout.METADATA)
     if data is None:
         return
     metadata = Metadata.from_json(data, f"{plan.writer.location}/{layout.METADATA}")
-    sensors = [dict(sensor) for sensor in metadata.extra.get("sensors", [])]
-    if sensors and "height_m" not in sensors[0]:
+    extra = dict(metadata.extra)
+    sensors = [dict(sensor) for sensor in extra.get("sensors", [])]
+    if height_m is not None and sensors and "height_m" not in sensors[0]:
         sensors[0] |= {"height_m": round(height_m, 2), "height_from": "ground"}
-        updated = replace(metadata, extra={**metadata.extra, "sensors": sensors})
-        plan.writer.write_document(layout.METADATA, updated.to_json())
+        extra["sensors"] = sensors
+    if plan.findings and "findings" not in extra:
+        extra["findings"] = _recorded(plan.findings)
+    if extra != metadata.extra:
+        plan.writer.write_document(layout.METADATA, replace(metadata, extra=extra).to_json())
 
 
 def _write(plan: RecordingPlan, documents: dict[str, bytes | None]) -> None:
@@ -431,9 +678,7 @@ def frame_times(recording: Recording, times: FloatArray | None) -> FloatArray:
     return check_seconds(np.asarray(times[:frames], np.float64), recording.location)
 
 
-def read_trajectory(
-    recording: Recording, times: FloatArray, options: PoseOptions
-) -> Trajectory | None:
+def read_trajectory(recording: Recording, options: PoseOptions) -> Trajectory | None:
     """Return the poses of the vehicle at their own times, from the recording's files; None if they
     must be estimated.
 
@@ -441,7 +686,6 @@ def read_trajectory(
 
     Args:
         recording: the recording.
-        times: (F,) seconds by frame number.
         options: where poses come from.
 
     Raises:
@@ -467,7 +711,7 @@ def read_trajectory(
                 found=f"{len(trajectory.world_T_vehicle)} lines in the file of poses",
                 advice=f"copy it again, or {_ESTIMATE}",
             )
-        return at_frames(trajectory.world_T_vehicle[: last + 1], times)
+        return replace(trajectory, world_T_vehicle=trajectory.world_T_vehicle[: last + 1])
     if len(trajectory.seconds) == 1 < len(recording.frames):
         raise FormatError(
             recording.location,
@@ -491,7 +735,7 @@ def at_frames(world_T_vehicle: FloatArray, times: FloatArray) -> Trajectory:
 def scan_poses(trajectory: Trajectory, recording: Recording, times: FloatArray) -> FloatArray:
     """Return (F, 4, 4) first_T_scan by frame number.
 
-    Poses with the times of frames are not changed, others are interpolated.
+    Poses of frames, or with their times, are not changed, others are interpolated.
 
     Args:
         trajectory: poses of the vehicle, with times.
@@ -499,8 +743,11 @@ def scan_poses(trajectory: Trajectory, recording: Recording, times: FloatArray) 
         times: (F,) seconds by frame number, by the same clock.
     """
     given = trajectory.world_T_vehicle
-    same = trajectory.seconds is not None and np.array_equal(trajectory.seconds, times)
-    poses = (given if same else trajectory.at(times)) @ recording.vehicle_T_scan
+    seconds = trajectory.seconds
+    if seconds is not None and not np.array_equal(seconds, times):
+        # frames beyond the poses are not converted
+        given = trajectory.at(times.clip(seconds[0] - POSE_S, seconds[-1] + POSE_S))
+    poses = given @ recording.vehicle_T_scan
     return relative_to(poses[0], poses)
 
 
@@ -552,6 +799,7 @@ def estimate_poses(
     times: FloatArray,
     step: Callable[[], object],
     run: Run,
+    checked: str | None,
 ) -> FloatArray:
     """Estimate the pose of each scan with KISS-ICP.
 
@@ -567,6 +815,7 @@ def estimate_poses(
         times: (F,) seconds by frame number.
         step: called for each frame.
         run: how the reading of scans is spread.
+        checked: the recording, for errors; None if the poses are accepted without a check.
 
     Returns:
         (F, 4, 4) first_T_scan by frame number, right-handed.
@@ -576,7 +825,7 @@ def estimate_poses(
         MissingDataError: no scan has enough points.
         DependencyError: kiss-icp is not installed.
     """
-    rig = Rig(tuple(recording.sensors), recording.vehicle_T_scan)
+    rig = Rig.of(recording)
     errors: list[CarlascError | OSError] = []
 
     def scans() -> Iterator[tuple[int, UsableScan]]:
@@ -588,14 +837,17 @@ def estimate_poses(
                 else:
                     yield handle.number, scan
 
-    poses = dict(follow(scans(), converter, times))
+    poses = dict(follow(scans(), converter, times, checked))
     if len(errors) == len(recording.frames):
         raise errors[0]
     return fill_gaps(poses, recording)
 
 
 def follow(
-    scans: Iterable[tuple[int, UsableScan]], converter: Converter, times: FloatArray
+    scans: Iterable[tuple[int, UsableScan]],
+    converter: Converter,
+    times: FloatArray,
+    checked: str | None,
 ) -> Iterator[tuple[int, FloatArray]]:
     """Yield the frame number and the (4, 4) first_T_scan of each scan with enough points, estimated
     with KISS-ICP.
@@ -604,33 +856,38 @@ def follow(
         scans: frame numbers and scans, in order.
         converter: the converter, for the range of points to use.
         times: (F,) seconds by frame number.
+        checked: the recording, for errors; None if the poses are accepted without a check.
 
     Raises:
         DependencyError: kiss-icp is not installed.
+        FormatError: the sensor stands, although its scans are taken from other and other places.
     """
     from carlasc.motion import odometry
 
     numbers: list[int] = []
     read_at: list[float] = []
+    centres, poses = ScanCentres(), list[FloatArray]()
 
     def usable() -> Iterator[UsableScan]:
         for number, scan in scans:
             if len(scan[0]) >= odometry.MIN_POINTS:
                 numbers.append(number)
                 read_at.append(float(times[number]))
+                centres.add(scan[0])
                 yield scan
 
-    yield from (
-        (numbers[index], pose)
-        for index, pose in enumerate(
-            odometry.follow_scans(
-                usable(),
-                times=read_at,
-                min_range_m=converter.min_range_m or 0.0,
-                max_range_m=converter.max_range_m or 100.0,
-            )
+    for index, pose in enumerate(
+        odometry.follow_scans(
+            usable(),
+            times=read_at,
+            min_range_m=converter.min_range_m or 0.0,
+            max_range_m=converter.max_range_m or 100.0,
         )
-    )
+    ):
+        poses.append(pose)
+        yield numbers[index], pose
+    if poses and checked is not None:
+        centres.check(np.stack(poses), checked)
 
 
 def fill_gaps(poses: Mapping[int, FloatArray], recording: Recording) -> FloatArray:
@@ -670,16 +927,7 @@ def check_poses(recording: Recording, converter: Converter, poses: FloatArray) -
     Raises:
         FormatError: scans do not overlap; the message names the likely mistake, and what to do.
     """
-    rig = Rig(tuple(recording.sensors), recording.vehicle_T_scan)
-
-    def structure(index: int) -> FloatArray:
-        try:
-            scan = read_scan(recording.frames[index], rig, None)
-        except (CarlascError, OSError):
-            return np.empty((0, 3))  # the conversion of the frame reports the error
-        return structure_of(scan.points[:, :3], scan.labels, None, converter.classes)
-
-    diagnosis = diagnose_poses(structure, poses[[handle.number for handle in recording.frames]])
+    diagnosis = _diagnose(recording, converter, poses)
     expected = "poses under which the scans overlap"
     if diagnosis.correction is not None:
         raise FormatError(
@@ -702,3 +950,17 @@ def check_poses(recording: Recording, converter: Converter, poses: FloatArray) -
     mounting = None if diagnosis.quality is None else diagnosis.quality.mounting
     described = None if mounting is None else describe_mounting(mounting)
     return None if described is None else f"{described[0]}: {described[1]}, or {_ESTIMATE}"
+
+
+def _diagnose(recording: Recording, converter: Converter, poses: FloatArray) -> PoseDiagnosis:
+    """Measure how well some scans overlap under their poses."""
+    rig = Rig.of(recording)
+
+    def structure(index: int) -> FloatArray:
+        try:
+            scan = read_scan(recording.frames[index], rig, None)
+        except (CarlascError, OSError):
+            return np.empty((0, 3))  # the conversion of the frame reports the error
+        return structure_of(scan.points[:, :3], scan.labels, None, converter.classes)
+
+    return diagnose_poses(structure, poses[[handle.number for handle in recording.frames]])

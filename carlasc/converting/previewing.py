@@ -9,32 +9,23 @@ from typing import Any
 
 import numpy as np
 
-from carlasc.converting.assembling import Assembled, Rig, read_scan
+from carlasc.converting.assembling import Assembled, LayoutOptions, Rig, read_scan
 from carlasc.converting.plans import (
     FILE,
     KISS_ICP,
+    Examined,
     SplitName,
     choose_recordings,
-    frame_times,
-    read_trajectory,
+    examine,
 )
+from carlasc.converting.plausibility import find_mount
 from carlasc.converting.protocol import Converter, Recording
 from carlasc.converting.registry import find_recordings, open_converter
-from carlasc.core.arrays import Float32Array
+from carlasc.core.frames import FrameRange, Frames
 from carlasc.errors import CarlascError
-from carlasc.motion.ground import find_ground
+from carlasc.inspection.findings import Finding
 from carlasc.motion.options import PoseOptions
 from carlasc.storage.files import AnyPath
-
-_LEAST_M = 0.3  # ground must be at least this far below the sensor
-_UP = {
-    "+z": (0, 1, 2),
-    "-z": (0, 1, 2),
-    "+y": (2, 0, 1),
-    "-y": (2, 0, 1),
-    "+x": (1, 2, 0),
-    "-x": (1, 2, 0),
-}
 
 
 @dataclass(frozen=True)
@@ -57,6 +48,7 @@ class RecordingPreview:
             if no ground was found.
         poses: "file", or "kiss-icp" if they would be estimated from the scans.
         notes: notes for the user, one line each.
+        findings: what is probably wrong ("warning"), and what would stop a conversion ("error").
     """
 
     name: str
@@ -73,6 +65,7 @@ class RecordingPreview:
     height_m: float | None
     poses: str
     notes: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def preview(
@@ -80,17 +73,21 @@ def preview(
     source: AnyPath,
     *,
     sequences: Collection[str] | None = None,
+    frames: Frames = None,
     split: SplitName = "all",
+    layout: LayoutOptions = LayoutOptions(),  # noqa: B008 (frozen)
     poses: PoseOptions = PoseOptions(),  # noqa: B008 (frozen)
     options: Mapping[str, Any] | None = None,
 ) -> tuple[RecordingPreview, ...]:
-    """Return what `convert` with the same arguments would read.
+    """Return what `convert` with the same arguments would read, and what it would find.
 
     Args:
         name: the converter: its name, or a class that inherits `Converter`.
         source: folder of the data set, or of one of its sequences.
         sequences: names of sequences or the last parts of them; None for all.
+        frames: numbers of the frames that would be converted; None for all.
         split: only sequences of this split.
+        layout: whether scans would be turned upright.
         poses: where poses would come from.
         options: options of the converter, by name.
 
@@ -101,21 +98,24 @@ def preview(
     """
     converter = open_converter(name, Path(source), options)
     recordings = choose_recordings(find_recordings(converter), Path(source), sequences, split)
-    return tuple(_preview(recording, poses) for recording in recordings)
-
-
-def _preview(recording: Recording, poses: PoseOptions) -> RecordingPreview:
-    times = recording.times()
-    trajectory = read_trajectory(recording, frame_times(recording, times), poses)
-    scan = _first_scan(recording)
-    steps = (
-        np.zeros(0)
-        if times is None
-        else np.diff(times[[handle.number for handle in recording.frames]])
+    chosen = FrameRange.of(frames)
+    return tuple(
+        _preview(
+            examine(
+                recording, converter, poses, frames=chosen, level=layout.level, known=poses.force
+            )
+        )
+        for recording in recordings
     )
+
+
+def _preview(seen: Examined) -> RecordingPreview:
+    recording, scan = seen.recording, _first_scan(seen.recording)
+    mount = seen.mount or find_mount([scan.points])
+    steps = np.diff(seen.times[[handle.number for handle in recording.frames]])
+    timed = seen.has_times and len(steps) and np.median(steps) > 0
     given = {"labels": scan.labels, "instances": scan.instances}
     points = scan.points[:, :3]
-    up, height_m = _ground(points)
     lower, upper = (
         tuple(round(float(value), 2) for value in edge(points, axis=0)) for edge in (np.min, np.max)
     )
@@ -124,22 +124,23 @@ def _preview(recording: Recording, poses: PoseOptions) -> RecordingPreview:
         recording.split,
         recording.location,
         len(recording.frames),
-        round(float(1 / np.median(steps)), 2) if len(steps) and np.median(steps) > 0 else None,
+        round(float(1 / np.median(steps)), 2) if timed else None,
         tuple(sensor.name for sensor in recording.sensors),
         ("points", *(field for field, values in given.items() if values is not None), *scan.fields),
         len(points),
         lower,  # type: ignore[arg-type]
         upper,  # type: ignore[arg-type]
-        up,
-        height_m,
-        KISS_ICP if trajectory is None else FILE,
-        tuple(recording.notes()),
+        None if mount is None else mount.up,
+        None if mount is None else round(mount.height_m, 2),
+        KISS_ICP if seen.trajectory is None else FILE,
+        (*recording.notes(), *seen.notes),
+        tuple(seen.findings),
     )
 
 
 def _first_scan(recording: Recording) -> Assembled:
     """Return the first scan that can be read; the error of the first one if there is none."""
-    rig, problem = Rig(tuple(recording.sensors), recording.vehicle_T_scan), None
+    rig, problem = Rig.of(recording), None
     for handle in recording.frames:
         try:
             return read_scan(handle, rig, None)
@@ -147,15 +148,3 @@ def _first_scan(recording: Recording) -> Assembled:
             problem = problem or error
     assert problem is not None
     raise problem
-
-
-def _ground(points: Float32Array) -> tuple[str | None, float | None]:
-    """Return the direction away from the ground, and the height of the sensor above it, of (N, 3)
-    points.
-    """
-    for up, order in _UP.items():
-        turned = points[:, order] * np.array([1, 1, -1 if up.startswith("-") else 1], np.float32)
-        ground = find_ground([turned])
-        if ground is not None and ground.below_m > _LEAST_M:
-            return up, round(ground.below_m, 2)
-    return None, None

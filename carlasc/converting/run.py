@@ -18,11 +18,15 @@ from carlasc.converting.assembling import LayoutOptions
 from carlasc.converting.plans import SplitName, choose_recordings, plan_recording, sequence_path
 from carlasc.converting.protocol import Converter, Failure, Recording, check_outside
 from carlasc.converting.registry import find_recordings, open_converter
+from carlasc.converting.sources import SourceFiles
 from carlasc.converting.stages import Conversion
+from carlasc.core.choices import CompareInputs
+from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError, MissingDataError, check_choice
+from carlasc.errors import ArgumentError, MissingDataError, check_choice, check_types
 from carlasc.groundtruth.options import FromScans, GridOptions, Voting, fit_to_ground
 from carlasc.groundtruth.run import regrid
+from carlasc.inspection.findings import Finding
 from carlasc.motion.ground import Ground, joined
 from carlasc.motion.options import PoseOptions
 from carlasc.running.processes import one_pool
@@ -52,6 +56,7 @@ class ConvertResult:
         failures: frames that could not be converted, or whose grid could not be made.
         grids: locations of the grids that were made from scans.
         notes: remarks about the result, one line each.
+        findings: what is probably wrong; carlasc.json of each sequence has them, too.
         elapsed_s: duration in seconds.
     """
 
@@ -61,6 +66,7 @@ class ConvertResult:
     failures: tuple[Failure, ...]
     grids: tuple[str, ...]
     notes: tuple[str, ...]
+    findings: tuple[Finding, ...]
     elapsed_s: float
 
 
@@ -70,17 +76,22 @@ def convert(
     out: AnyPath | Sink,
     *,
     sequences: Collection[str] | None = None,
+    frames: Frames = None,
     split: SplitName = "all",
     layout: LayoutOptions = LayoutOptions(),  # noqa: B008 (frozen)
     poses: PoseOptions = PoseOptions(),  # noqa: B008 (frozen)
     grids: Grids = GridOptions(),  # noqa: B008 (frozen)
     options: Mapping[str, Any] | None = None,
+    compare_inputs: CompareInputs = "fast",
+    allow_gaps: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> ConvertResult:
     """Write another data set as sequences of the CarlaSC layout: the same files, axes and classes;
     then make their grids, as `regrid` does.
 
-    A second run skips the frames that exist. A frame that cannot be read is reported in the result,
+    A second run skips the frames that exist, unless files of the data set changed since then: the
+    frames of the recordings that may have been read from these are made again, and those that
+    differ are replaced. A frame that cannot be read is reported in the result,
     and the others are converted. Worker processes import the main module again: scripts call this
     under `if __name__ == "__main__":`, or with `run=Run(workers=1)`.
 
@@ -91,6 +102,7 @@ def convert(
         out: where to write: a folder or a `.zarr` store, on this machine or in an object store; or
             any Sink, with grids if it can be read while it is written.
         sequences: which ones, by their names or the last part of them ("00"); None converts all.
+        frames: numbers of the frames to convert, of every sequence; None converts all.
         split: "train", "val" or "test": only sequences of this split; "all" converts every split.
         layout: how sequences are written: their classes, their axes, and whether they get flow.
         poses: where poses come from, and whether poses are accepted if scans do not overlap under
@@ -99,6 +111,11 @@ def convert(
             own voxels, with count 0 where they are unknown; None writes no grids.
         options: options of the converter, by name; text is parsed as the type of the option (see
             `option_declarations`).
+        compare_inputs: how it is found out whether the data set changed: "fast": by the names,
+            sizes and times of its files; "content": all frames are made again and compared;
+            "never": existing frames are kept.
+        allow_gaps: finish frames that take labels, motion or votes from a frame that failed.
+            Otherwise they wait until it is repaired.
         run: how the work is spread. A part converts whole recordings, because poses and motion are
             estimated along each of them. Grids then keep their height, because the ground of the
             other recordings is not known.
@@ -113,6 +130,7 @@ def convert(
         ConflictError: `out` lies inside `source`, or holds other data.
         StorageError: the output cannot be written. The files written so far are complete.
     """
+    check_types(convert, locals())
     start = time.perf_counter()
     root = Path(source)
     converter = open_converter(name, root, options)
@@ -120,7 +138,9 @@ def convert(
     check_shared(sink.location, run)
     _check(root, sink, split, grids, run.part)
 
-    recordings = choose_recordings(find_recordings(converter), root, sequences, split)
+    check_choice("compare_inputs", compare_inputs, CompareInputs)
+    found = find_recordings(converter)
+    recordings = choose_recordings(found, root, sequences, split)
     recordings = _deal(recordings, run.part)
     if isinstance(grids, GridOptions):
         _check_rays(recordings)
@@ -128,9 +148,19 @@ def convert(
     plans = []
     for one in recordings:
         planned = plan_recording(
-            one, converter, sink, target, poses, flow=has_flow, voxels=has_voxels
+            one,
+            converter,
+            sink,
+            target,
+            poses,
+            frames=FrameRange.of(frames),
+            level=layout.level,
+            flow=has_flow,
+            voxels=has_voxels,
         )
         plans.append(planned)
+    sources = SourceFiles.of(root, found, options, compare_inputs)
+    records = [sources.begin(plan) for plan in plans]
     origin = f"{name if isinstance(name, str) else name.__name__} {root.name}"
     ranges = converter.min_range_m, converter.max_range_m
     said = {name: getattr(converter, name) for name in ("license", "citation", "simulated")}
@@ -140,37 +170,51 @@ def convert(
     steps = StepCounter(run.progress, sum(len(plan.recording.frames) for plan in plans))
     with one_pool(run) as pooled:
         conversions = [
-            Conversion(plan, converter, target, layout.images, pooled, steps) for plan in plans
+            Conversion(plan, converter, target, layout.images, pooled, steps, allow_gaps)
+            for plan in plans
         ]
         with ExitStack() as writers:
             for conversion in conversions:
                 writers.enter_context(conversion.plan.writer)
                 conversion.run(metadata)
+            for conversion, record in zip(conversions, records, strict=True):
+                record.finish(conversion)
         if sink is not out:
             sink.finish(incomplete=True)  # missing frames could not be read, and are reported
         made = None
         if isinstance(grids, GridOptions):
             alone = replace(pooled, part=Part(), progress=steps.stage())
-            converted = [conversion for conversion in conversions if conversion.has_scans]
+            # without the motion that some frames wait for, grids would be made in another way
+            converted = [one for one in conversions if one.has_scans and not one.waits]
             if converted:  # otherwise every frame failed, and is reported
                 scans = _ConvertedScans(sink, converted)
                 spec, observe, cut = _plan_grids(grids, converted, scans, poses)
                 voting = grids.voting or Voting()
-                made = regrid(scans, spec, out, observe=observe, voting=voting, run=alone)
+                made = regrid(
+                    scans,
+                    spec,
+                    out,
+                    observe=observe,
+                    voting=voting,
+                    compare_inputs=compare_inputs,
+                    run=alone,
+                )
                 made = replace(made, notes=(*cut, *made.notes))
 
     failures = [failure for conversion in conversions for failure in conversion.failures]
-    notes = [note for conversion in conversions for note in conversion.notes]
+    notes = [note for record in records for note in record.notes]
+    notes += [note for conversion in conversions for note in conversion.notes]
     if made is not None:
         failures += [Failure(one.sequence, one.frame, one.message) for one in made.failures]
         notes += made.notes
     return ConvertResult(
         tuple(sink.place(sequence_path(recording)) for recording in recordings),
         sum(conversion.made for conversion in conversions),
-        sum(len(plan.recording.frames) - len(plan.unfinished) for plan in plans),
+        sum(conversion.skipped for conversion in conversions),
         tuple(failures),
         () if made is None else made.grids,
         tuple(notes),
+        tuple(finding for plan in plans for finding in plan.findings),
         time.perf_counter() - start,
     )
 
@@ -180,14 +224,15 @@ class _ConvertedScans(Source):
 
     def __init__(self, sink: Sink, conversions: Series[Conversion]) -> None:
         self.location, self._source = sink.location, sink.source()
-        self._paths = {sequence_path(conversion.plan.recording) for conversion in conversions}
+        self._chosen = {sequence_path(one.plan.recording): one for one in conversions}
 
     def sequences(self) -> dict[str, Sequence]:
-        return {
-            path: sequence
-            for path, sequence in self._source.sequences().items()
-            if path in self._paths
-        }
+        found = self._source.sequences()
+        chosen = {path: found[path] for path in found if path in self._chosen}
+        for path, sequence in chosen.items():
+            conversion = self._chosen[path]
+            sequence.awaited = frozenset() if conversion.allow_gaps else conversion.failed
+        return chosen
 
 
 def _plan_grids(

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from carlasc.converting.actors import (
+    MAX_GAP,
     ActorMotion,
     ActorObservation,
     Fields,
@@ -41,9 +42,10 @@ from carlasc.converting.plans import (
     estimate_poses,
     fill_gaps,
     follow,
-    write_heights,
+    write_found,
     write_poses,
 )
+from carlasc.converting.plausibility import check_mount, find_mount
 from carlasc.converting.protocol import Converter, Failure, FrameHandle
 from carlasc.core.arrays import AnyArray, Float32Array, FloatArray
 from carlasc.core.boxes import Boxes
@@ -58,6 +60,7 @@ from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.camera_files import cameras_to_json
+from carlasc.storage.inputs import digest_of
 from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import SequenceWriter
 
@@ -98,6 +101,8 @@ class ConvertedFrame:
         points: (N, 3) float32 points to estimate poses from, right-handed, if they were requested.
         actors: its numbered actors, if they were requested.
         unnumbered: number of its moving points that belong to no numbered actor.
+        names: names of the fields that were made.
+        changed: whether any of them was not in the output already.
     """
 
     number: int
@@ -106,6 +111,8 @@ class ConvertedFrame:
     points: Float32Array | None = None
     actors: tuple[ActorObservation, ...] = ()
     unnumbered: int = 0
+    names: frozenset[str] = frozenset()
+    changed: bool = False
 
 
 @dataclass(frozen=True)
@@ -119,6 +126,7 @@ class ScanStage:
         voxels: geometry of the frames' own voxel grids, right-handed, if they are written.
         for_odometry: whether their points are returned, from which poses are estimated.
         for_actors: whether their actors are returned, whose motion is estimated.
+        again: whether voxels that are written already are read again.
     """
 
     target: AxesAndClasses
@@ -127,6 +135,7 @@ class ScanStage:
     voxels: GridSpec | None = None
     for_odometry: bool = False
     for_actors: bool = False
+    again: bool = False
 
     def make(self, job: ScanJob, frame: ConvertedFrame) -> Fields:
         """Read a frame; return the fields of its scan and of its own voxel grid, and add other
@@ -152,7 +161,7 @@ class ScanStage:
         none, or if it is written already.
         """
         grid = layout.grid_folder(spec)
-        written = self.writer.has(f"{grid}/counts", handle.number)
+        written = not self.again and self.writer.has(f"{grid}/counts", handle.number)
         voxels = None if written else handle.read_voxels()
         if voxels is None:
             return {}
@@ -175,10 +184,12 @@ class Block:
     Attributes:
         stage: makes the fields of each frame.
         jobs: the frames: a `ScanJob` or a `MotionJob` each, as the stage takes them.
+        again: whether only fields that differ from those in the output are written.
     """
 
     stage: ScanStage | MotionStage
     jobs: tuple[Any, ...]
+    again: bool = False
 
     def convert(self) -> list[ConvertedFrame]:
         """Convert the frames, and write them if the writer can be used in workers.
@@ -192,6 +203,10 @@ class Block:
         for job, frame in zip(self.jobs, frames, strict=True):
             try:
                 frame.fields = self.stage.make(job, frame)
+                frame.names = frozenset(frame.fields)
+                if self.again:
+                    frame.fields = _different(self.stage.writer, frame.number, frame.fields)
+                frame.changed = bool(frame.fields)
             except StorageError:
                 raise
             except (CarlascError, OSError) as error:
@@ -205,6 +220,17 @@ class Block:
         return [ConvertedFrame(job.handle.number, failure=message) for job in self.jobs]
 
 
+def _different(writer: SequenceWriter, number: int, fields: Fields) -> Fields:
+    """Return the fields that differ from those in the output."""
+    return {
+        name: array
+        for name, array in fields.items()
+        if not writer.has(name, number)
+        or (there := writer.read(name, number)) is None
+        or digest_of(name, there) != digest_of(name, array)
+    }
+
+
 def write_frames(writer: SequenceWriter, frames: Iterable[ConvertedFrame]) -> None:
     """Write the fields of some frames, in the order of each frame, and drop them from memory."""
     frames = list(frames)
@@ -212,6 +238,11 @@ def write_frames(writer: SequenceWriter, frames: Iterable[ConvertedFrame]) -> No
         writer.write_frames(fields)
     for frame in frames:
         frame.fields = {}
+
+
+def waits_for(failed: int) -> str:
+    """Return why a frame is not finished: another one failed."""
+    return f"frame {failed}, which failed: repair that one, or finish with `allow_gaps=True`"
 
 
 def in_blocks(
@@ -241,6 +272,7 @@ class Conversion:
         steps: called after each frame of each stage.
         failures: frames that failed.
         notes: remarks about the result, one line each.
+        allow_gaps: whether frames are finished that take labels or motion from a frame that failed.
         ground: the ground in some of its scans; None if none was found, or scans cannot be read
             back.
     """
@@ -251,10 +283,14 @@ class Conversion:
     images: Images
     run_options: Run
     steps: StepCounter
+    allow_gaps: bool = False
     failures: list[Failure] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     ground: Ground | None = None
     _failed: set[int] = field(default_factory=set)
+    _held: set[int] = field(default_factory=set)
+    _changed: set[int] = field(default_factory=set)
+    _names: dict[int, frozenset[str]] = field(default_factory=dict)
     _unnumbered: int = 0
 
     def run(self, metadata: Metadata) -> None:
@@ -266,7 +302,12 @@ class Conversion:
             self.steps.expect(len(plan.recording.frames))
             plan.take_estimate(
                 estimate_poses(
-                    plan.recording, self.converter, plan.times, self.steps, self.run_options
+                    plan.recording,
+                    self.converter,
+                    plan.times,
+                    self.steps,
+                    self.run_options,
+                    plan.checked,
                 )
             )
             write_poses(plan, self.target)
@@ -281,10 +322,59 @@ class Conversion:
         self.notes += self._remarks()
         self.notes += _write_cameras(plan, self.target, self.images)
 
+    def remove_others(self, earlier: Iterable[int]) -> None:
+        """Remove fields, and frames of an earlier run, that the data set has no longer.
+
+        Raises:
+            ConflictError: the store cannot remove frames.
+        """
+        plan = self.plan
+        gone = set(earlier) - {handle.number for handle in plan.recording.frames}
+        if gone:
+            grid = [] if plan.voxels is None else [layout.grid_folder(plan.voxels)]
+            own = [f"{name}/{part}" for name in grid for part in ("labels", "counts")]
+            images = [
+                f"images.{camera.name}.{suffix}"
+                for camera in plan.recording.cameras()
+                for suffix in layout.IMAGE_SUFFIXES
+            ]
+            plan.writer.remove_frames([*layout.SCAN_FIELDS, *own, *images], gone)
+        for number, made in self._names.items():
+            others = [
+                name
+                for name in layout.SCAN_FIELDS
+                if name not in made and plan.writer.has(name, number)
+            ]
+            if others and number not in self._failed:
+                plan.writer.remove_frames(others, [number])
+                self._changed.add(number)
+
+    @property
+    def changed(self) -> frozenset[int]:
+        """Numbers of the frames that were not in the output already."""
+        return frozenset(self._changed)
+
+    @property
+    def waits(self) -> bool:
+        """Whether any frame waits for one that failed. The grids of the recording then wait too."""
+        return bool(self._held)
+
+    @property
+    def failed(self) -> frozenset[int]:
+        """Numbers of the frames that failed."""
+        return frozenset(self._failed)
+
     @property
     def made(self) -> int:
         """Number of frames that were converted."""
-        return len(self.plan.unfinished - self._failed)
+        made = self._changed if self.plan.again else self.plan.unfinished
+        return len(made - self._failed - self._held)
+
+    @property
+    def skipped(self) -> int:
+        """Number of frames that were kept."""
+        kept = {handle.number for handle in self.plan.recording.frames} - self._failed - self._held
+        return len(kept) - self.made
 
     @property
     def has_scans(self) -> bool:
@@ -309,7 +399,9 @@ class Conversion:
             if follow or estimate or handle.number in plan.missing or plan.voxels
         ]
         self.steps(len(plan.recording.frames) - len(chosen))
-        stage = ScanStage(self.target, plan.writer, plan.rig, plan.voxels, estimate, follow)
+        stage = ScanStage(
+            self.target, plan.writer, plan.rig, plan.voxels, estimate, follow, plan.again
+        )
         blocks = [
             Block(
                 stage,
@@ -317,6 +409,7 @@ class Conversion:
                     ScanJob(handle, plan.motion(handle), handle.number in plan.missing)
                     for handle in part
                 ),
+                plan.again,
             )
             for part in in_blocks(chosen, plan.writer)
         ]
@@ -353,7 +446,7 @@ class Conversion:
                     waiting[result.number] = result
                     yield result.number, (points, None)
 
-        for number, pose in follow(scans(), self.converter, self.plan.times):
+        for number, pose in follow(scans(), self.converter, self.plan.times, self.plan.checked):
             yield waiting.pop(number), pose
 
     def _work(self, blocks: Sequence[Block]) -> Iterator[ConvertedFrame]:
@@ -375,6 +468,11 @@ class Conversion:
             for frames in results:
                 write_frames(self.plan.writer, frames)
                 for frame in frames:
+                    self._names[frame.number] = frame.names | self._names.get(
+                        frame.number, frozenset()
+                    )
+                    if frame.changed:
+                        self._changed.add(frame.number)
                     if frame.failure is not None:
                         self._failed.add(frame.number)
                         self.failures.append(
@@ -386,10 +484,20 @@ class Conversion:
     def _finish(self, velocities: Mapping[int, Mapping[int, Velocity]]) -> None:
         """Add labels, instances, boxes and flow from the motion of actors."""
         plan = self.plan
+        todo = plan.unfinished - self._failed if plan.added else set[int]()
+        waiting = {} if self.allow_gaps else self._waiting(velocities)
+        self.failures += [
+            Failure(
+                plan.recording.location,
+                number,
+                f"{plan.recording.location}: frame {number} waits for {waits_for(failed)}",
+            )
+            for number, failed in sorted(waiting.items())
+            if number in todo
+        ]
+        self._held |= waiting.keys() & todo
         wanted = [
-            handle
-            for handle in plan.recording.frames
-            if plan.added and handle.number in plan.unfinished and handle.number not in self._failed
+            handle for handle in plan.recording.frames if handle.number in todo - waiting.keys()
         ]
         if not wanted or plan.poses is None:
             return
@@ -408,11 +516,36 @@ class Conversion:
                     boxes.get(handle.number),
                     self._labelled_around(handle),
                     plan.recording.has_labels and handle.labelled,
+                    self._names.get(handle.number),
                 )
                 for handle in part
             ]
-            blocks.append(Block(stage, tuple(jobs)))
+            blocks.append(Block(stage, tuple(jobs), plan.again))
         deque(self._work(blocks), maxlen=0)  # frames are written; nothing is kept
+
+    def _waiting(self, velocities: Mapping[int, Mapping[int, Velocity]]) -> dict[int, int]:
+        """Return the frames that take labels or motion from a frame that failed, each with the
+        number of that frame.
+        """
+        waiting = dict[int, int]()
+        frames: dict[int, list[int]] = {}
+        for number, actors in velocities.items():
+            for actor in actors:
+                frames.setdefault(actor, []).append(number)
+        for own in frames.values():
+            reach = range(min(own) - MAX_GAP, max(own) + MAX_GAP + 1)
+            failed = [number for number in sorted(self._failed) if number in reach]
+            waiting |= dict.fromkeys(own, failed[0]) if failed else {}
+        for handle in self.plan.recording.frames if self.plan.recording.has_labels else ():
+            near = [] if handle.labelled else self._neighbours(handle)
+            failed = [other.number for other in near if other.number in self._failed]
+            waiting |= {handle.number: failed[0]} if failed else {}
+        return waiting
+
+    def _neighbours(self, handle: FrameHandle) -> list[FrameHandle]:
+        """Return the frames with labels of their own before and after a frame."""
+        place = bisect(self._labelled, handle.number, key=attrgetter("number"))
+        return self._labelled[max(place - 1, 0) : place + 1]
 
     def _labelled_around(self, handle: FrameHandle) -> tuple[MotionJob, ...]:
         """Return the labelled frames before and after an unlabelled frame of a recording with
@@ -421,19 +554,23 @@ class Conversion:
         plan = self.plan
         if handle.labelled or not plan.recording.has_labels or plan.poses is None:
             return ()
-        place = bisect(self._labelled, handle.number, key=attrgetter("number"))
-        near = self._labelled[max(place - 1, 0) : place + 1]
         return tuple(
-            MotionJob(other, plan.motion(other), plan.poses[other.number]) for other in near
+            MotionJob(
+                other,
+                plan.motion(other),
+                plan.poses[other.number],
+                own=self._names.get(other.number),
+            )
+            for other in self._neighbours(handle)
         )
 
     @cached_property
     def _labelled(self) -> list[FrameHandle]:
-        """The frames with labels of their own."""
+        """The frames with labels of their own; without `allow_gaps`, also those that failed."""
         return [
             handle
             for handle in self.plan.recording.frames
-            if handle.labelled and handle.number not in self._failed
+            if handle.labelled and not (self.allow_gaps and handle.number in self._failed)
         ]
 
     def _box_tracks(self) -> tuple[list[Track] | None, dict[int, Boxes]]:
@@ -456,8 +593,8 @@ class Conversion:
         return tracks_from_boxes(boxes, poses, times), boxes
 
     def _find_ground(self) -> None:
-        """Find the ground in some of the scans, and write the height of the sensor if the data set
-        does not say it.
+        """Find the ground in some of the scans; write the height of the sensor if the data set
+        does not say it, and what was found.
         """
         plan, frames = self.plan, [handle.number for handle in self.plan.recording.frames]
         chosen = {frames[i] for i in np.linspace(0, len(frames) - 1, _GROUND_FRAMES).astype(int)}
@@ -468,12 +605,15 @@ class Conversion:
             and (points := plan.writer.read("points", number)) is not None
         ]
         self.ground = find_ground(scans)
-        if self.ground is not None:
-            write_heights(plan, self.ground.below_m)
+        if plan.recording.rays and not plan.findings:
+            plan.findings += check_mount(find_mount(scans), plan.recording.location, force=True)
+        write_found(plan, None if self.ground is None else self.ground.below_m)
 
     def _remarks(self) -> list[str]:
         plan = self.plan
         notes = [*plan.recording.notes(), *plan.notes]
+        if self.waits:
+            notes.append("its grids wait, too, until all frames are converted")
         unlabelled = sum(not handle.labelled for handle in plan.recording.frames)
         if plan.boxes is not None and not plan.recording.has_labels:
             notes.append(
@@ -550,10 +690,10 @@ def _copy_images(plan: RecordingPlan, cameras: Sequence[CameraModel]) -> list[st
     for handle in plan.recording.frames:
         blocks.setdefault(handle.number // plan.writer.block, []).append(handle.number)
     for numbers in blocks.values():
-        by_frame: dict[int, dict[str, np.ndarray]] = {}
+        by_frame: dict[int, dict[str, AnyArray]] = {}
         for number in numbers:
             for camera in cameras:
-                if any(
+                if not plan.again and any(
                     plan.writer.has(f"images.{camera.name}.{suffix}", number)
                     for suffix in layout.IMAGE_SUFFIXES
                 ):
@@ -561,9 +701,9 @@ def _copy_images(plan: RecordingPlan, cameras: Sequence[CameraModel]) -> list[st
                 if (image := plan.recording.image(camera, number)) is None:
                     missing += 1
                     continue
-                by_frame.setdefault(number, {})[f"images.{camera.name}.{image[0]}"] = np.frombuffer(
-                    image[1], np.uint8
-                )
+                made = {f"images.{camera.name}.{image[0]}": np.frombuffer(image[1], np.uint8)}
+                by_frame.setdefault(number, {}).update(_different(plan.writer, number, made))
+        by_frame = {number: own for number, own in by_frame.items() if own}
         if by_frame:
             plan.writer.write_frames(by_frame)
     note = f"{missing} images of cameras do not exist, or are neither .jpg nor .png"

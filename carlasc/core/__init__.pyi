@@ -1,9 +1,5 @@
 from .benchmarks import IGNORED as IGNORED
-from .benchmarks import OCC3D as OCC3D
 from .benchmarks import OCC3D_TO_OPENOCCUPANCY as OCC3D_TO_OPENOCCUPANCY
-from .benchmarks import OPENOCCUPANCY as OPENOCCUPANCY
-from .benchmarks import SSCBENCH as SSCBENCH
-from .benchmarks import SSCBENCH_TO_RAW as SSCBENCH_TO_RAW
 from .benchmarks import TO_OCC3D as TO_OCC3D
 from .benchmarks import TO_SSCBENCH as TO_SSCBENCH
 from .boxes import BOXES_DTYPE as BOXES_DTYPE
@@ -13,6 +9,7 @@ from .cameras import CameraModel as CameraModel
 from .classes import ClassTable as ClassTable
 from .classes import Color as Color
 from .classes import Remap as Remap
+from .classes import TableUse as TableUse
 from .classes import class_weights as class_weights
 from .frames import FrameRange as FrameRange
 from .frames import Frames as Frames
@@ -40,10 +37,14 @@ from .scans import runs_of_origins as runs_of_origins
 from .scans import sorted_by_origin as sorted_by_origin
 from .tables import CARLA as CARLA
 from .tables import CARLASC11 as CARLASC11
+from .tables import OCC3D as OCC3D
+from .tables import OPENOCCUPANCY as OPENOCCUPANCY
 from .tables import REMAPS as REMAPS
 from .tables import SEMANTICKITTI as SEMANTICKITTI
 from .tables import SEMANTICKITTI19 as SEMANTICKITTI19
 from .tables import SEMANTICPOSS as SEMANTICPOSS
+from .tables import SSCBENCH as SSCBENCH
+from .tables import SSCBENCH_TO_RAW as SSCBENCH_TO_RAW
 from .tables import TABLES as TABLES
 from .tables import TRAIN_VOXEL_COUNTS as TRAIN_VOXEL_COUNTS
 from .tables import remap_named as remap_named

@@ -24,7 +24,7 @@ from carlasc.core.geometry import (
     quaternions_of,
     transform_points,
 )
-from carlasc.errors import FormatError
+from carlasc.errors import FormatError, check_types
 
 BOXES_DTYPE = np.dtype(
     [("track", "<u4"), ("label", "<u4")]
@@ -78,6 +78,7 @@ class Boxes:
     annotated: BoolArray
 
     def __post_init__(self) -> None:
+        check_types(Boxes, vars(self))
         count = len(self.tracks)
         shapes = {
             "tracks": (),

@@ -32,6 +32,11 @@ RefineMode = Literal["auto", "always", "never"]
 MotionSource = Literal["auto", "boxes", "instances", "flow", "evidence", "none"]
 """How moving points are found."""
 
+CompareInputs = Literal["fast", "content", "never"]
+"""How the inputs of existing outputs are compared with those of now: by size and time and then by
+content where these differ, by content, or not at all.
+"""
+
 TrafficLevel = Literal["light", "medium", "heavy"]
 """Amount of simulated traffic."""
 

@@ -7,15 +7,15 @@ See the format page, `docs/format.md#classes` (CarlaSC, and the renumbering in C
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
 
 from carlasc.core.arrays import AnyIntArray, FloatArray, Int32Array, LabelArray, Uint8Array
-from carlasc.errors import ArgumentError, FormatError, first_names
+from carlasc.errors import ArgumentError, FormatError, check_types, first_names
 
 Color = tuple[int, int, int]
 ROLES = ("moving", "movable", "deformable", "ground")
@@ -28,7 +28,8 @@ _MAX_ID = 65535  # ids are kept in 16 bits in memory
 class ClassTable:
     """A set of classes: the name, the colour and the roles of each id.
 
-    Id 0 means unlabelled for points and free for voxels. It has no role.
+    Id 0 means unlabelled for points and free for voxels. It has no role. Files of some benchmarks
+    have another id for free voxels, which becomes 0 when they are read (`with_free_first`).
 
     Attributes:
         name: name of the table, as in carlasc.json.
@@ -43,6 +44,7 @@ class ClassTable:
             `ground`.
         num_channels: number of vote channels, greater than every id. It may be greater than
             necessary if the format requires it.
+        free: id of free voxels.
 
     Raises:
         ArgumentError: an id has no name or no colour, or a value has the wrong type or range.
@@ -58,8 +60,10 @@ class ClassTable:
     geometry_only: int | None = None
     ground_only: int | None = None
     num_channels: int = 0
+    free: int = 0
 
     def __post_init__(self) -> None:
+        check_types(ClassTable, vars(self))
         where = f"class table {self.name}"
         ids = set(self.names)
         if not ids or min(ids) < 0 or max(ids) > _MAX_ID:
@@ -70,6 +74,7 @@ class ClassTable:
             ("a name and a colour for each id", ids ^ set(self.colors)),
             *((f"ids of the table in {role}", getattr(self, role) - ids) for role in ROLES),
             ("an id of the table in geometry_only", {self.geometry_only} - ids - {None}),
+            ("an id of the table in free", {self.free} - ids - {0}),
             ("an id of ground in ground_only", {self.ground_only} - self.ground - {None}),
         ):
             if wrong:
@@ -104,14 +109,17 @@ class ClassTable:
                 found=", ".join(map(str, unknown)),
             )
         try:
+            names = {int(i): str(name) for i, name in _by_id(values["names"]).items()}
+            colors = values.get("colors", default_colors(names))
             return cls(
                 str(values["name"]),
-                {int(index): str(name) for index, name in values["names"].items()},
-                {int(index): color_of(color) for index, color in values["colors"].items()},
+                names,
+                {int(i): color_of(color) for i, color in _by_id(colors).items()},
                 **{role: frozenset(map(int, values.get(role, ()))) for role in ROLES},
                 geometry_only=_id_or_none(values.get("geometry_only")),
                 ground_only=_id_or_none(values.get("ground_only")),
                 num_channels=int(values.get("num_channels", 0)),
+                free=int(values.get("free", 0)),
             )
         except KeyError as error:
             raise FormatError(
@@ -141,7 +149,32 @@ class ClassTable:
         values |= {
             name: getattr(self, name) for name in _WITHOUT_LABELS if getattr(self, name) is not None
         }
+        values |= {"free": self.free} if self.free else {}
         return values | {"num_channels": self.num_channels}
+
+    @cached_property
+    def with_free_first(self) -> ClassTable:
+        """The table of voxels in which the ids of free space and 0 are exchanged, so that free is
+        0; the table itself if free is 0.
+        """
+        if not self.free:
+            return self
+        swap = {0: self.free, self.free: 0}
+
+        def swapped(ids: Iterable[int]) -> list[int]:
+            return [swap.get(i, i) for i in ids]
+
+        return replace(
+            self,
+            name=f"{self.name}-free0",
+            names=dict(sorted(zip(swapped(self.names), self.names.values(), strict=True))),
+            colors=dict(sorted(zip(swapped(self.colors), self.colors.values(), strict=True))),
+            free=0,
+            moving=frozenset(swapped(self.moving)),
+            movable=frozenset(swapped(self.movable)),
+            deformable=frozenset(swapped(self.deformable)),
+            ground=frozenset(swapped(self.ground)),
+        )
 
     @cached_property
     def standing(self) -> dict[int, int]:
@@ -194,19 +227,84 @@ class ClassTable:
             found="none of them",
         )
 
-    def check(self, labels: AnyIntArray, where: str) -> None:
-        """Raise a FormatError if an id in `labels`, of any shape, is not in [0, `num_channels`).
-
-        `where` is the file named in the message.
+    def unknown(self, labels: AnyIntArray) -> dict[int, int]:
+        """Return the ids in `labels`, of any shape, that are no class of the table, with their
+        numbers of occurrences.
         """
-        if labels.size and (int(labels.max()) >= self.num_channels or int(labels.min()) < 0):
-            bad = int(labels.max()) if int(labels.max()) >= self.num_channels else int(labels.min())
-            count = int(np.count_nonzero(labels == bad))
+        top = max(self.names)
+        if not labels.size or (
+            int(labels.min()) >= 0 and int(labels.max()) <= top == len(self.names) - 1
+        ):
+            return {}
+        if labels.dtype.kind == "u" and int(labels.max()) <= top:
+            listed = np.zeros(top + 1, np.bool_)
+            listed[list(self.names)] = True
+            if listed[labels].all():
+                return {}
+        ids, counts = np.unique(labels, return_counts=True)
+        found = zip(ids.tolist(), counts.tolist(), strict=True)
+        return {i: n for i, n in found if i not in self.names}
+
+    def check(self, labels: AnyIntArray, where: str) -> None:
+        """Raise a FormatError if an id in `labels`, of any shape, is no class of the table.
+
+        `where` is the file named in the message, which proposes a table that has all of the ids.
+        """
+        if unknown := self.unknown(labels):
+            others = [table.name for table in tables_with(np.unique(labels).tolist(), self)]
+            advice = "correct the labels"
+            if others:
+                advice = (
+                    f"if they are ids of {others[0]}, write "
+                    f'{{"format": 2, "classes": "{others[0]}"}} to carlasc.json; otherwise {advice}'
+                )
             raise FormatError(
                 where,
-                expected=f"class ids 0..{self.num_channels - 1} (table {self.name})",
-                found=f"{bad} in {count} of {labels.size} labels",
+                expected=f"class ids of {self.name}",
+                found=f"{times(unknown)} of {labels.size} labels",
+                advice=advice,
             )
+
+
+_FOUND = {
+    "option": "given",
+    "file": "named in the files",
+    "format": "of the format",
+    "ids": "found by the ids",
+    "assumed": "assumed: no file names one",
+}
+
+
+@dataclass(frozen=True, order=True)
+class TableUse:
+    """A class table by which labels were read, and what named it.
+
+    Attributes:
+        table: name of the table.
+        found: "option" (`source_classes`), "file" (the metadata of the data), "format" (the files
+            of a benchmark), "ids" (found by the ids of the labels), or "assumed".
+    """
+
+    table: str
+    found: str
+
+    def __str__(self) -> str:
+        return f"{self.table} ({_FOUND[self.found]})"
+
+
+BUILT_IN: dict[str, ClassTable] = {}
+"""The class tables of `carlasc.core.TABLES`, by name."""
+
+
+def tables_with(ids: Collection[int], like: ClassTable) -> list[ClassTable]:
+    """Return the other built-in tables that have all of the ids, those named after `like` first."""
+    tables = [t for t in BUILT_IN.values() if t != like and t.names.keys() >= set(ids)]
+    return sorted(tables, key=lambda t: (not t.name.startswith(like.name), len(t.names)))
+
+
+def times(counts: Mapping[int, int]) -> str:
+    """Return ids with their numbers of occurrences, for messages: "23 (4 times), 24 (2 times)"."""
+    return ", ".join(f"{i} ({n} times)" for i, n in counts.items())
 
 
 @dataclass(frozen=True)
@@ -226,6 +324,7 @@ class Remap:
     mapping: Mapping[int, int]
 
     def __post_init__(self) -> None:
+        check_types(Remap, vars(self))
         object.__setattr__(self, "mapping", dict(self.mapping))
         for old, new in self.mapping.items():
             if old < 0 or new not in self.target.names:
@@ -276,11 +375,10 @@ class Remap:
         )
         if not outside and (self._complete or not (self.table[labels] < 0).any()):
             return self._lookup[labels]
-        found = ", ".join(f"{i} ({n} times)" for i, n in self.unknown(labels).items())
         raise FormatError(
             where,
             expected=f"class ids of {self.source.name}",
-            found=found,
+            found=times(self.unknown(labels)),
             advice=f"the remap {self.name} has no target for these ids: use another remap, or "
             f"correct the labels",
         )
@@ -315,6 +413,18 @@ def class_weights(voxel_counts: AnyIntArray, remap: Remap | None = None) -> Floa
     weights[common] = 1.0 / np.log(counts[common] + 0.001)
     weights[(counts > 0) & ~common] = weights.max(initial=0.0) or 1.0
     return weights
+
+
+def default_colors(ids: Iterable[int]) -> dict[int, Color]:
+    """Return a colour for each id, for tables that name none: white for 0, otherwise well apart."""
+    return {
+        i: (110 + 13 * i % 120, 90 + 29 * i % 130, 80 + 47 * i % 140) if i else (255, 255, 255)
+        for i in ids
+    }
+
+
+def _by_id(values: Any) -> Mapping[Any, Any]:
+    return dict(enumerate(values)) if isinstance(values, list) else values
 
 
 def _id_or_none(value: Any) -> int | None:

@@ -11,7 +11,8 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntFlag
-from typing import Any, TypeVar
+from numbers import Real
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,7 @@ from carlasc.core.arrays import (
 from carlasc.core.choices import Coordinates as Coordinates  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import Preset
 from carlasc.core.notebook import describe
-from carlasc.errors import ArgumentError, FormatError, check_choice
+from carlasc.errors import ArgumentError, FormatError, check_choice, check_types
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 Triple = tuple[float, float, float]
@@ -67,10 +68,12 @@ class GridSpec:
     upper: Triple
 
     def __post_init__(self) -> None:
+        check_types(GridSpec, vars(self))
         check_choice("coordinates", self.coordinates, Coordinates)
         for name, kind in (("size", int), ("lower", float), ("upper", float)):
-            values = tuple(kind(v) for v in getattr(self, name))
-            if len(values) != 3 or not all(math.isfinite(v) for v in values):
+            given = tuple(getattr(self, name))
+            values = tuple(map(kind, given)) if all(map(is_finite, given)) else ()
+            if len(values) != 3:
                 raise ArgumentError(
                     f"grid {name}", expected="three finite numbers", found=str(getattr(self, name))
                 )
@@ -120,6 +123,24 @@ class GridSpec:
         }
         check_choice("published grid", name, (*presets, "cartesian"))
         return presets["coarse" if name == "cartesian" else name]
+
+    @classmethod
+    def of(cls, spec: GridSpec | str | float) -> GridSpec:
+        """Return a grid, given by itself, by the name of a published grid, or by the size of its
+        cells in metres, within the bounds of the published grid.
+
+        Raises:
+            ArgumentError: no grid has that name, or the size is not positive.
+        """
+        if isinstance(spec, GridSpec):
+            return spec
+        if isinstance(spec, str):
+            check_choice("spec", spec, Preset)
+            return cls.published(cast(Preset, spec))
+        if not (is_finite(spec) and spec > 0):
+            expected = "a GridSpec, the name of a published grid, or the size of cells in metres"
+            raise ArgumentError("spec", expected=expected, found=repr(spec))
+        return cls.published().with_resolution(spec)
 
     @classmethod
     def from_params(cls, params: Mapping[str, Any], where: str = "params.json") -> GridSpec:
@@ -181,10 +202,9 @@ class GridSpec:
         Raises:
             ArgumentError: a resolution is not a positive number.
         """
-        per_axis = [
-            float(v) for v in (resolution if isinstance(resolution, Sequence) else [resolution])
-        ]
-        if len(per_axis) not in (1, 3) or not all(math.isfinite(r) and r > 0 for r in per_axis):
+        per_axis = list(resolution) if isinstance(resolution, Iterable) else [resolution]
+        positive = all(is_finite(r) and r > 0 for r in per_axis)
+        if len(per_axis) not in (1, 3) or not positive:
             raise ArgumentError(
                 "resolution",
                 expected="one or three positive numbers",
@@ -364,6 +384,7 @@ class Grid:
     counts: AnyArray | None = None
 
     def __post_init__(self) -> None:
+        check_types(Grid, vars(self))
         for name, array in (("labels", self.labels), ("counts", self.counts)):
             if array is not None and array.shape != self.spec.size:
                 raise FormatError(
@@ -390,6 +411,11 @@ class Grid:
             "classes": np.unique(self.labels[self.labels > 0]).tolist(),
         }
         return describe(repr(self), rows, spec.seen_from_above(self.labels))
+
+
+def is_finite(value: Any) -> bool:
+    """Whether a value is a number, neither NaN nor infinite."""
+    return isinstance(value, Real) and math.isfinite(value)
 
 
 def _three(values: Iterable[Any]) -> Any:

@@ -25,7 +25,7 @@ from carlasc.core.boxes import Boxes, mirror_boxes
 from carlasc.core.geometry import Transform, invert, mirror_points, transform_points, translation
 from carlasc.core.grids import GridSpec
 from carlasc.core.notebook import describe
-from carlasc.errors import FormatError, count
+from carlasc.errors import FormatError, check_types, count
 
 _TURN = 65_000  # steps of azimuth per turn, of about 0.1 mrad; they fit into 16 bits
 
@@ -58,6 +58,7 @@ class Scan:
     boxes: Boxes | None = None
 
     def __post_init__(self) -> None:
+        check_types(Scan, vars(self))
         if self.points.ndim != 2 or self.points.shape[1] != 3:
             raise FormatError("scan points", expected="shape (N, 3)", found=str(self.points.shape))
         count = len(self.points)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from carlasc.core.arrays import LabelArray
-from carlasc.core.classes import ClassTable, Remap, color_of
+from carlasc.core.classes import BUILT_IN, ClassTable, Remap, color_of
 from carlasc.errors import ArgumentError, FormatError, check_choice
 
 
@@ -175,6 +175,153 @@ SEMANTICPOSS = ClassTable(
 )
 
 
+# tags of CARLA 0.9.14 and later, in order, and CarlaOcc's Rock
+_TAGS = lines_of("""
+    None 255 255 255
+    Road 128 64 128
+    Sidewalk 244 35 232
+    Building 70 70 70
+    Wall 102 102 156
+    Fence 100 40 40
+    Pole 153 153 153
+    TrafficLight 250 170 30
+    TrafficSign 220 220 0
+    Vegetation 107 142 35
+    Terrain 145 170 100
+    Sky 70 130 180
+    Pedestrian 220 20 60
+    Rider 255 0 0
+    Car 0 0 142
+    Truck 0 0 70
+    Bus 0 60 100
+    Train 0 80 100
+    Motorcycle 0 0 230
+    Bicycle 119 11 32
+    Static 110 190 160
+    Dynamic 170 120 50
+    Other 55 90 80
+    Water 45 60 150
+    RoadLine 157 234 50
+    Ground 81 0 81
+    Bridge 150 100 100
+    RailTrack 230 150 140
+    GuardRail 180 165 180
+    Rock 180 130 70
+""")
+
+
+def _tags(name: str, number: int) -> ClassTable:
+    return ClassTable(
+        name,
+        {tag: label for tag, (label, *_) in enumerate(_TAGS[:number])},
+        {tag: color_of(rgb) for tag, (_, *rgb) in enumerate(_TAGS[:number])},
+        movable=frozenset(range(12, 20)),
+        deformable=frozenset({12}),
+        ground=frozenset({1, 2, 10, 23, 24, 25, 26, 27}),
+        geometry_only=22,  # Other
+    )
+
+
+CARLA0914, CARLAOCC = _tags("carla0.9.14", 29), _tags("carlaocc", 30)
+
+# the classes of SSCBench, and their raw ids in its files
+_SSCBENCH = [
+    (name, int(raw))
+    for name, raw in lines_of("""
+    empty 0
+    car 10
+    bicycle 11
+    motorcycle 15
+    truck 18
+    other-vehicle 20
+    person 30
+    road 40
+    parking 44
+    sidewalk 48
+    other-ground 49
+    building 50
+    fence 51
+    vegetation 70
+    terrain 72
+    pole 80
+    traffic-sign 81
+    other-structure 52
+    other-object 99
+""")
+]
+SSCBENCH = ClassTable(
+    "sscbench",
+    dict(enumerate(name for name, _ in _SSCBENCH)),
+    {i: SEMANTICKITTI.colors[raw] for i, (_, raw) in enumerate(_SSCBENCH)},
+    movable=frozenset(range(1, 7)),
+    deformable=frozenset({6}),
+    ground=frozenset({7, 8, 9, 10, 14}),
+)
+SSCBENCH_TO_RAW: Mapping[int, int] = MappingProxyType(
+    {i: raw for i, (_, raw) in enumerate(_SSCBENCH)}
+)
+"""Class of SSCBench -> raw id of SemanticKITTI in its files."""
+
+# the classes of nuScenes-lidarseg, with the colours in which papers draw them
+_NUSCENES = {
+    name: color_of(rgb)
+    for name, *rgb in lines_of("""
+    barrier 255 120 50
+    bicycle 255 192 203
+    bus 235 225 20
+    car 0 150 245
+    construction-vehicle 0 225 225
+    motorcycle 255 165 0
+    pedestrian 255 0 0
+    traffic-cone 245 215 130
+    trailer 135 60 0
+    truck 160 32 240
+    driveable-surface 255 0 255
+    other-flat 139 137 137
+    sidewalk 75 0 75
+    terrain 150 240 80
+    manmade 190 190 210
+    vegetation 0 175 0
+""")
+}
+
+
+def _nuscenes(name: str, first: str, names: Iterable[str], free: int) -> ClassTable:
+    """Return a table of nuScenes' classes: `first` if it is not empty, then `names`; `free` is the
+    id of free space.
+    """
+    order = [name for name in (first, *names) if name]
+    if free == len(order):
+        order.append("free")
+    ids = {name: i for i, name in enumerate(order)}
+    colors = {"others": (90, 90, 90), "empty": (255, 255, 255), "free": (255, 255, 255)}
+    return ClassTable(
+        name,
+        dict(enumerate(order)),
+        {i: (_NUSCENES | colors)[name] for name, i in ids.items()},
+        movable=frozenset(
+            ids[n]
+            for n in lines_of(
+                "bicycle bus car construction-vehicle motorcycle pedestrian trailer truck"
+            )[0]
+        ),
+        deformable=frozenset({ids["pedestrian"]}),
+        ground=frozenset(
+            ids[n] for n in ("driveable-surface", "other-flat", "sidewalk", "terrain")
+        ),
+        free=free,
+    )
+
+
+OCC3D = _nuscenes("occ3d", "others", _NUSCENES, 17)
+OPENOCCUPANCY = _nuscenes("openoccupancy", "empty", _NUSCENES, 0)
+_OCCNET = lines_of(
+    "car truck trailer bus construction-vehicle bicycle motorcycle pedestrian traffic-cone barrier "
+    "driveable-surface other-flat sidewalk terrain manmade vegetation"
+)[0]
+OCCNET = _nuscenes("occnet", "", _OCCNET, 16)
+
+
 REMAPS: Mapping[str, Remap] = MappingProxyType(
     {
         remap.name: remap
@@ -208,11 +355,7 @@ REMAPS: Mapping[str, Remap] = MappingProxyType(
             # CARLA above
             Remap(
                 "carla0914_to_carla",
-                ClassTable(
-                    "carla0.9.14",
-                    {i: f"tag {i}" for i in range(29)},
-                    dict.fromkeys(range(29), (128, 128, 128)),
-                ),
+                CARLA0914,
                 CARLA,
                 id_map(
                     "0->0 1->7 2->8 3->1 4->11 5->2 6->5 7->18 8->12 9->9 10->22 11->13 12,13->4 "
@@ -222,9 +365,14 @@ REMAPS: Mapping[str, Remap] = MappingProxyType(
         )
     }
 )
-TABLES: Mapping[str, ClassTable] = MappingProxyType(
-    {t.name: t for t in (CARLA, CARLASC11, SEMANTICKITTI, SEMANTICKITTI19, SEMANTICPOSS)}
-)
+BUILT_IN.update(
+    (table.name, table)
+    for table in (
+        CARLA, CARLASC11, SEMANTICKITTI, SEMANTICKITTI19, SEMANTICPOSS, CARLA0914, CARLAOCC,
+        SSCBENCH, OCC3D, OPENOCCUPANCY, OCCNET,
+    )
+)  # fmt: skip
+TABLES: Mapping[str, ClassTable] = MappingProxyType(BUILT_IN)
 
 TRAIN_VOXEL_COUNTS = np.array(
     [
@@ -275,6 +423,39 @@ def table_from_json(value: object, where: str) -> ClassTable:
             advice="give the table a new name",
         )
     return table if known is None else known
+
+
+def classes_from(value: object, where: str) -> tuple[ClassTable, Remap | None]:
+    """Return the class table of a file of classes, and its map from the ids of another table.
+
+    Args:
+        value: as for `table_from_json`, also with the keys `map` (ids of this table by ids of the
+            other one: a mapping, or a text such as "1->7 14..19->10") and `from` (name of the
+            other table; without it, carla).
+        where: the file, for errors.
+
+    Returns:
+        The table, and the remap to it; None without `map`.
+
+    Raises:
+        FormatError: the values are not valid.
+    """
+    if not isinstance(value, Mapping) or not {"map", "from"} & value.keys():
+        return table_from_json(value, where), None
+    values = dict(value)
+    mapping, source = values.pop("map", {}), table_from_json(values.pop("from", CARLA.name), where)
+    table = table_from_json(values, where)
+    try:
+        ids = id_map(mapping) if isinstance(mapping, str) else mapping
+        return table, Remap(table.name, source, table, {int(i): int(new) for i, new in ids.items()})
+    except ArgumentError as error:
+        raise FormatError(f"{where}: map", expected=error.expected, found=error.found) from error
+    except (TypeError, ValueError, AttributeError) as error:
+        raise FormatError(
+            f"{where}: map",
+            expected='ids by ids, or a text such as "1->7 14..19->10"',
+            found=str(error),
+        ) from error
 
 
 def table_to_json(table: ClassTable) -> str | dict[str, Any]:

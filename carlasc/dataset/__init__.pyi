@@ -7,4 +7,5 @@ from .labels import RemapLike as RemapLike
 from .photographs import ResizeImages as ResizeImages
 from .samples import Dataset as Dataset
 from .sampling import ShardSampler as ShardSampler
+from .transforms import Augment as Augment
 from .transforms import Flip as Flip

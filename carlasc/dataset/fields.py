@@ -12,12 +12,12 @@ from carlasc.core.arrays import (
     BoolArray,
     Float32Array,
     FloatArray,
+    Int32Array,
     IntArray,
     Uint8Array,
-    Uint16Array,
 )
 from carlasc.core.cameras import CameraModel
-from carlasc.errors import import_extra
+from carlasc.errors import ArgumentError, check_types, import_extra
 
 FIELDS = (
     "occupancy",
@@ -40,6 +40,7 @@ ACTOR_FIELDS = ("instances", "voxel_flow")
 CAMERA_FIELDS = ("camera_visible", "images", "cameras")
 """Fields of data with cameras."""
 ALWAYS = ("valid", "sequence", "frame")
+STACKS = frozenset({"occupancy", "density", "visibility"})  # one grid per scan
 PLAIN = ("cameras",)  # no arrays
 RAGGED = ("points", "point_labels", "flow", "remission")  # one row per point of the scan
 
@@ -51,22 +52,22 @@ class Sample(TypedDict, total=False):
     """
 
     occupancy: Uint8Array
-    density: Uint16Array
+    density: Int32Array
     visibility: Uint8Array
-    labels: NDArray[np.unsignedinteger[Any]]
+    labels: NDArray[np.integer[Any]]
     known: BoolArray
     counts: Float32Array
     posterior: Float32Array
     occupied: Float32Array
     flags: Uint8Array
-    views: Uint16Array
+    views: Int32Array
     instances: IntArray
     voxel_flow: Float32Array
     camera_visible: Uint8Array
     images: Mapping[str, Uint8Array]
     cameras: Mapping[str, CameraModel]
     points: Float32Array
-    point_labels: NDArray[np.unsignedinteger[Any]]
+    point_labels: NDArray[np.integer[Any]]
     flow: Float32Array
     remission: Float32Array
     poses: FloatArray
@@ -88,8 +89,12 @@ def collate(samples: Sequence[Mapping[str, object]]) -> dict[str, Any]:
     list, one per sample. All other fields are stacked as by torch's default_collate does.
 
     Raises:
+        ArgumentError: there are no samples.
         DependencyError: torch is not installed.
     """
+    check_types(collate, locals())
+    if not samples or not all(isinstance(sample, Mapping) for sample in samples):
+        raise ArgumentError("samples", expected="samples of a Dataset", found=repr(samples)[:80])
     torch = import_extra("torch", "torch")
     given: list[Values] = [dict(sample) for sample in samples]
     dense = [

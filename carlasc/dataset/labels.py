@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Integral
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,15 +14,16 @@ from numpy.typing import ArrayLike
 from carlasc.core.arrays import AnyArray, AnyFloatArray, BoolArray, Float32Array, LabelArray
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.grids import VoxelFlag, is_confident
-from carlasc.core.tables import benchmark_remap, remap_named
+from carlasc.core.tables import benchmark_remap
 from carlasc.dataset.fields import Values
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.storage import Sequence, layout
+from carlasc.storage.class_files import read_remap
 from carlasc.storage.field_files import dense_velocity
 
 RemapLike = str | Remap | Mapping[int, int] | ArrayLike | None
-"""Type of `remap` arguments: a name in `carlasc.core.REMAPS`, a Remap, a mapping or table of ids,
-"auto"; None keeps the ids.
+"""Type of `remap` arguments: a name in `carlasc.core.REMAPS`, a JSON or YAML file of classes with a
+map, a Remap, a mapping or table of ids, "auto"; None keeps the ids.
 """
 
 _GREY = (128, 128, 128)
@@ -44,23 +46,24 @@ class LabelMap:
         self.name = self._remap.name if self._remap else "none"
         self.source = self._remap.source if self._remap else classes
         self.target = self._remap.target if self._remap else classes
-        self._table = (
-            self._remap.table if self._remap else np.arange(classes.num_channels, dtype=np.int32)
-        )
+        kept = Remap("none", classes, classes, {i: i for i in classes.names})
+        self._table = (self._remap or kept).table
 
     def __call__(self, labels: LabelArray, where: str) -> LabelArray:
-        """Map labels of any shape to the target table, in its dtype.
+        """Map labels of any shape to the target table, as uint8, or int32 if ids exceed 255.
 
         Raises:
             FormatError: an id is not in the source table. `where` is the file named in the message.
         """
         from carlasc.dataset.stacking import look_up
 
-        mapped = look_up(labels, self._table, self.target.dtype)
+        # torch cannot compute with uint16
+        dtype = np.dtype(np.int32) if self.target.dtype.itemsize > 1 else self.target.dtype
+        mapped = look_up(labels, self._table, dtype)
         if mapped is None and self._remap is not None:
             return self._remap(labels, where)  # raises an error with the id
         if mapped is None:
-            self.source.check(labels, where)
+            self.source.check(labels, where)  # raises an error with the ids and a proposal
             raise FormatError(where, expected=f"class ids of {self.source.name}")
         return mapped
 
@@ -69,8 +72,10 @@ def _as_remap(remap: str | Remap | Mapping[int, int] | ArrayLike, classes: Class
     if isinstance(remap, Remap):
         return remap
     if isinstance(remap, str):
-        return remap_named(remap)
+        return read_remap(remap)
     if isinstance(remap, Mapping):
+        if wrong := [f"{a!r}: {b!r}" for a, b in remap.items() if not _are_ids(a, b)]:
+            raise ArgumentError("remap", expected="whole numbers as ids", found=wrong[0])
         mapping = {int(old): int(new) for old, new in remap.items()}
     else:
         table = np.asarray(remap)
@@ -86,6 +91,10 @@ def _as_remap(remap: str | Remap | Mapping[int, int] | ArrayLike, classes: Class
     ids = sorted(set(mapping.values()))
     target = ClassTable("custom", {i: f"class {i}" for i in ids}, dict.fromkeys(ids, _GREY))
     return Remap("custom", classes, target, mapping)
+
+
+def _are_ids(*values: object) -> bool:
+    return all(isinstance(value, Integral) for value in values)
 
 
 _PARTS = {  # field of a sample -> fields of the grid
@@ -106,7 +115,7 @@ OF_GRID = frozenset(_PARTS)
 _PLAIN: dict[str, type[np.generic]] = {
     "occupied": np.float32,
     "flags": np.uint8,
-    "views": np.uint16,
+    "views": np.int32,
     "instances": np.int64,
     "camera_visible": np.uint8,
 }

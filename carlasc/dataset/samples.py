@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import operator
+import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
@@ -27,6 +28,7 @@ from carlasc.dataset.fields import (
     CAMERA_FIELDS,
     EVIDENCE_FIELDS,
     FIELDS,
+    STACKS,
     Sample,
     Values,
 )
@@ -41,22 +43,31 @@ from carlasc.dataset.selection import (
     find_grid_name,
     find_grid_sequences,
 )
-from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_choice, count
+from carlasc.dataset.torch_bases import NoBase, inherit
+from carlasc.dataset.transforms import Augment, Placement, check_symmetric, mirror, moved
+from carlasc.errors import (
+    ArgumentError,
+    FormatError,
+    MissingDataError,
+    check_choice,
+    check_types,
+    count,
+)
 from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.camera_files import image_fields
 from carlasc.storage.files import AnyPath
 from carlasc.storage.transport.caching import CachedTree
+from carlasc.storage.views import ChosenSequences
 
-_STACKS = frozenset({"occupancy", "density", "visibility"})
 # field of a sample -> field of the scan
 _OF_SCAN = {"points": "points", "point_labels": "labels", "flow": "flow", "remission": "points"}
 
-if TYPE_CHECKING:  # for type checkers it is a torch Dataset; torch is not imported at run time
+if TYPE_CHECKING:
     from torch.utils.data import Dataset as TorchDataset
 
     _MapStyle = TorchDataset[Sample]
 else:
-    _MapStyle = object
+    _MapStyle = NoBase  # until torch is imported
 
 
 class Dataset(_MapStyle):
@@ -67,10 +78,10 @@ class Dataset(_MapStyle):
 
         occupancy     (T, X, Y, Z) uint8, 1 where a scan has a point; the oldest scan first, the
                       scan of the frame last
-        density       (T, X, Y, Z) uint16, number of points per voxel
+        density       (T, X, Y, Z) int32, number of points per voxel
         visibility    (T, X, Y, Z) uint8, 2 where a scan has a point, 1 where only its rays passed,
                       0 elsewhere
-        labels        (X, Y, Z) uint8 class of each voxel (uint16 if ids exceed 255); 0 is free, and
+        labels        (X, Y, Z) uint8 class of each voxel (int32 if ids exceed 255); 0 is free, and
                       also unknown
         known         (X, Y, Z) bool, voxels with a vote: ignore all other voxels in losses and
                       metrics
@@ -80,7 +91,7 @@ class Dataset(_MapStyle):
         occupied      (X, Y, Z) float32, probability that the voxel is occupied; 0.5 where it is
                       unknown
         flags         (X, Y, Z) uint8, sums of `carlasc.VoxelFlag`
-        views         (X, Y, Z) uint16, number of scans that saw the voxel
+        views         (X, Y, Z) int32, number of scans that saw the voxel
         instances     (X, Y, Z) int64, number of the actor that the voxel belongs to, 0 for none;
                       the same in all frames of a sequence
         voxel_flow    (X, Y, Z, 3) float32 m/s, velocity of the actor in the voxel, sensor frame;
@@ -91,7 +102,7 @@ class Dataset(_MapStyle):
         cameras       {camera: `carlasc.core.CameraModel`}, with their poses at the times of these
                       images
         points        (N, 3) float32 metres, sensor frame of the frame; all points of the scan
-        point_labels  (N,) uint8 class of each point (uint16 if ids exceed 255)
+        point_labels  (N,) uint8 class of each point (int32 if ids exceed 255)
         flow          (N, 3) float32 m/s, velocity of each point, sensor frame
         remission     (N,) float32, fourth column of the scan: remission in KITTI, zero in CarlaSC
         poses         (T, 4, 4) float64 current_T_past; the identity where not valid
@@ -104,7 +115,7 @@ class Dataset(_MapStyle):
     `occupied`, `flags` and `views` need grids made with `carlasc.Voting(keep_evidence=True)`;
     `instances` and `voxel_flow` need grids made with `keep_actors=True`. Points outside the range
     `min_range_m` to `max_range_m` of carlasc.json are left out. Arrays have the axes of the
-    sequences: right-handed data are not mirrored, and cannot be mixed with left-handed data.
+    sequences. Right-handed and left-handed data are mixed only if `axes` is given.
 
     Attributes:
         sequences: the sequences in use, in order. `sequence` of a sample is the name of one of
@@ -118,15 +129,16 @@ class Dataset(_MapStyle):
 
     def __init__(
         self,
-        source: AnyPath | Source,
+        source: AnyPath | Source | Iterable[AnyPath | Source],
         split: str | Iterable[str] | None = None,
         *,
         history: int = 1,
         coordinates: Coordinates = "cartesian",
         grid: str | GridSpec = layout.EVALUATION,
-        grids_source: AnyPath | Source | None = None,
-        fields: Iterable[str] = ("occupancy", "labels", "known"),
+        grids_source: AnyPath | Source | Iterable[AnyPath | Source] | None = None,
+        fields: str | Iterable[str] = ("occupancy", "labels", "known"),
         remap: RemapLike = "auto",
+        axes: Axes | None = None,
         align: bool = True,
         inferred: bool = True,
         min_confidence: float = 0.0,
@@ -135,7 +147,7 @@ class Dataset(_MapStyle):
         """Find the frames. No scans or grids are read.
 
         Args:
-            source: anything that `carlasc.open` takes, or a Source.
+            source: anything that `carlasc.open` takes, or a Source, or several of them.
             split: "train", "val" or "test" (case-insensitive), the name of a sequence, or a list of
                 names; None takes all sequences.
             history: T, number of scans in a stack, including the scan of the frame.
@@ -153,6 +165,8 @@ class Dataset(_MapStyle):
                 (carlasc11 or semantickitti19; other tables keep their ids), a name in
                 `carlasc.core.REMAPS`, a Remap, a mapping of ids, or a table of new ids by old id;
                 None keeps the ids of the data.
+            axes: "left" or "right": mirrors y of sequences with the other axes, which needs a grid
+                that is symmetric in y. None keeps the axes of the data.
             align: move past scans to the sensor frame of the frame by their poses; False stacks
                 them unmoved.
             inferred: False excludes completed voxels, which no scan saw, from `known` and
@@ -160,7 +174,7 @@ class Dataset(_MapStyle):
             min_confidence: minimum probability: voxels that are neither free nor occupied with at
                 least this probability are excluded from `known` and `posterior`; 0 to 0.5 keeps
                 all.
-            transform: called with each sample.
+            transform: called with each sample. An `Augment` is applied before scans are binned.
 
         Raises:
             ArgumentError: an argument is not valid, or the remap is for another class table.
@@ -169,10 +183,11 @@ class Dataset(_MapStyle):
             FormatError: sequences differ in grid, axes or class table, or poses.txt does not fit
                 the scans.
         """
+        check_types(Dataset.__init__, locals())
         self.fields = _check_fields(fields)
-        if isinstance(history, bool) or not isinstance(history, int | np.integer) or history < 1:
+        if history < 1:
             raise ArgumentError(
-                "history", expected="a number of scans of 1 or more", found=repr(history)
+                "history", expected="a number of scans of 1 or more", found=str(history)
             )
         self.history = int(history)
         self.align = align
@@ -181,10 +196,10 @@ class Dataset(_MapStyle):
         coordinates = grid.coordinates if isinstance(grid, GridSpec) else coordinates
         check_choice("coordinates", coordinates, layout.COORDINATES)
 
-        opened = as_source(source)
+        opened = _opened(source)
         chosen = choose_sequences(opened, split, coordinates)
-        if self._asks(OF_GRID) or (self._asks(_STACKS) and isinstance(grid, str)):
-            grids_opened = opened if grids_source is None else as_source(grids_source)
+        if self._asks(OF_GRID) or (self._asks(STACKS) and isinstance(grid, str)):
+            grids_opened = opened if grids_source is None else _opened(grids_source)
             grids = find_grid_sequences(chosen, grids_opened, coordinates)
             self._parts = [
                 self._part(scans, sequence, find_grid_name(sequence, grid))
@@ -201,9 +216,10 @@ class Dataset(_MapStyle):
             )
 
         self.sequences = tuple(part.scans for part in self._parts)
-        self.axes: Axes = common_value(
-            {scans.location: scans.metadata.axes for scans in self.sequences}, "axes"
-        )
+        handedness = {scans.location: scans.metadata.axes for scans in self.sequences}
+        if axes is not None:
+            check_choice("axes", axes, Axes)
+        self.axes: Axes = common_value(handedness, "axes", "give `axes`") if axes is None else axes
         specs = {
             part.grids.location: part.grids.grids[part.grid]
             for part in self._parts
@@ -212,6 +228,8 @@ class Dataset(_MapStyle):
         self._spec = grid if isinstance(grid, GridSpec) else None
         if specs and self._spec is None:
             self._spec = common_value(specs, "grid geometry")
+        if self._spec is not None and set(handedness.values()) != {self.axes}:
+            check_symmetric(self._spec, "y")
         self._label_map = self._make_label_map(remap)
         self.classes: ClassTable = self._label_map.target
 
@@ -255,12 +273,13 @@ class Dataset(_MapStyle):
             raise IndexError(f"sample {place} is out of range: there are {len(self)} samples")
         part, frame = self._frame_at(place % len(self))
         past = part.history(frame, self.history)
+        placement = self._placement(part, frame)
 
         sample: Values = {}
         if self._needs_poses:
             sample["poses"] = part.current_T_past(frame, past)
-        if self._asks(_STACKS):
-            sample |= self._stacks(part, past, sample.get("poses"))
+        if self._asks(STACKS):
+            sample |= self._stacks(part, past, sample.get("poses"), placement)
         if part.grids is not None:
             sample |= self._grid_fields.read(part.grids, part.grid, frame, self._label_map)
         if self._asks(_OF_SCAN):
@@ -269,8 +288,12 @@ class Dataset(_MapStyle):
             sample |= read_cameras(part.scans, frame)
         sample["valid"] = np.array([number is not None for number in past])
         sample |= {"sequence": part.scans.name, "frame": frame}
-        requested = cast(Sample, {name: sample[name] for name in (*self.fields, *ALWAYS)})
-        return requested if self.transform is None else cast(Sample, self.transform(requested))
+        requested = {name: sample[name] for name in (*self.fields, *ALWAYS)}
+        if placement is not None:  # stacks are in their place already
+            requested = moved(requested, placement, self._spec, stacks=False)
+        if self.transform is None or isinstance(self.transform, Augment):
+            return cast(Sample, requested)
+        return cast(Sample, self.transform(cast(Sample, requested)))
 
     def _part_of(self, chosen: slice) -> Self:
         """Return a Dataset of a slice of the samples."""
@@ -365,11 +388,11 @@ class Dataset(_MapStyle):
 
     @property
     def _needs_poses(self) -> bool:
-        return "poses" in self.fields or (self._asks(_STACKS) and self.align and self.history > 1)
+        return "poses" in self.fields or (self._asks(STACKS) and self.align and self.history > 1)
 
     def _part(self, scans: Sequence, grids: Sequence | None, grid: str) -> SequenceFrames:
         wanted = {(scans, _OF_SCAN[field]): None for field in self.fields if field in _OF_SCAN}
-        if self._asks(_STACKS) or not self._asks(OF_GRID):
+        if self._asks(STACKS) or not self._asks(OF_GRID):
             wanted[scans, "points"] = None
         if grids is not None:
             parts = self._grid_fields.parts(grids, grid)
@@ -407,8 +430,22 @@ class Dataset(_MapStyle):
         which = int(np.searchsorted(self._starts, place, side="right")) - 1
         return self._parts[which], int(self._parts[which].frames[place - self._starts[which]])
 
+    def _placement(self, part: SequenceFrames, frame: int) -> Placement | None:
+        """Return where the sample of a frame is placed: mirrored to `axes`, and augmented."""
+        mirrored = None if part.scans.metadata.axes == self.axes else mirror("y")
+        if not isinstance(self.transform, Augment):
+            return mirrored
+        drawn = self.transform.place(part.scans.name, frame, self._spec)
+        if mirrored is None:
+            return drawn
+        return replace(drawn, new_T_old=drawn.new_T_old @ mirrored.new_T_old)
+
     def _stacks(
-        self, part: SequenceFrames, past: list[int | None], poses: FloatArray | None
+        self,
+        part: SequenceFrames,
+        past: list[int | None],
+        poses: FloatArray | None,
+        placement: Placement | None,
     ) -> Values:
         from carlasc.dataset.stacking import stack_scans
 
@@ -416,6 +453,14 @@ class Dataset(_MapStyle):
         if not self.align or poses is None:
             poses = np.tile(np.eye(4), (self.history, 1, 1))
         scans = self._recent.read(part.scans, past)
+        if placement is not None:
+            poses = placement.new_T_old @ poses
+            if placement.drop:
+                ages = range(len(scans) - 1, -1, -1)
+                scans = [
+                    None if scan is None else scan[placement.kept(len(scan), age)]
+                    for scan, age in zip(scans, ages, strict=True)
+                ]
         ranges = (part.scans.metadata.min_range_m, part.scans.metadata.max_range_m)
         stacks: Values = {}
         if "density" in self.fields:
@@ -456,6 +501,22 @@ class Dataset(_MapStyle):
                 f"{part.scans.location}: frame {frame}", expected="one value per point", found=found
             )
         return sample
+
+
+inherit(Dataset, "Dataset")
+
+
+def _opened(source: AnyPath | Source | Iterable[AnyPath | Source]) -> Source:
+    """Return one Source of everything that is given."""
+    if isinstance(source, str | os.PathLike | Source):
+        return as_source(source)
+    opened = [as_source(one) for one in source]
+    sequences = {
+        f"{number}/{path}": sequence
+        for number, one in enumerate(opened)
+        for path, sequence in one.sequences().items()
+    }
+    return ChosenSequences(", ".join(one.location for one in opened), sequences)
 
 
 def _check_fields(fields: Iterable[str]) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ during training.
 from __future__ import annotations
 
 import math
+import sys
 import threading
 import time
 import zlib
@@ -22,19 +23,20 @@ import numpy as np
 
 from carlasc.core.arrays import IntArray
 from carlasc.dataset.samples import Dataset
-from carlasc.errors import ArgumentError, CarlascError
+from carlasc.dataset.torch_bases import NoBase, inherit
+from carlasc.errors import ArgumentError, CarlascError, check_types
 from carlasc.storage.transport.caching import CachedTree
 
 _STORED_TOGETHER = 16  # frames per file of packed zarr stores
 # minimum length of a shard, relative to the additional frames that are read for histories
 _READ_AGAIN = 4
 
-if TYPE_CHECKING:  # for type checkers it is a torch Sampler; torch is not imported at run time
+if TYPE_CHECKING:
     from torch.utils.data import Sampler as TorchSampler
 
     _Sampler = TorchSampler[int]
 else:
-    _Sampler = object
+    _Sampler = NoBase  # until torch is imported
 
 
 class ShardSampler(_Sampler):
@@ -67,8 +69,8 @@ class ShardSampler(_Sampler):
         epoch: the current or next epoch.
         shard: number of frames per shard.
         window: number of shards whose frames are mixed.
+        num_replicas: number of processes.
         rank: number of this process.
-        world: number of processes.
     """
 
     def __init__(
@@ -78,8 +80,8 @@ class ShardSampler(_Sampler):
         seed: int = 0,
         shard: int | None = None,
         window: int = 8,
-        rank: int = 0,
-        world: int = 1,
+        num_replicas: int | None = None,
+        rank: int | None = None,
         read_ahead: int = 2,
     ) -> None:
         """Number the shards. No data are read.
@@ -92,39 +94,64 @@ class ShardSampler(_Sampler):
                 also needs earlier frames for the histories of its first samples.
             window: number of shards whose frames are mixed. A larger window mixes better, and needs
                 a larger cache.
-            rank: number of this process, from 0.
-            world: number of processes that train together.
+            num_replicas: number of processes that train together. None: those of the process group
+                of torch.distributed, or 1 without one.
+            rank: number of this process, from 0. None: that in the process group.
             read_ahead: number of shards that are fetched in advance; 0 turns this off.
 
         Raises:
             ArgumentError: an argument is not valid.
         """
-        least = {"seed": 0, "shard": 1, "window": 1, "rank": 0, "world": 1, "read_ahead": 0}
-        given = (seed, 1 if shard is None else shard, window, rank, world, read_ahead)
-        for (name, lowest), value in zip(least.items(), given, strict=True):
-            if value < lowest:
-                raise ArgumentError(name, expected=f"{lowest} or more", found=str(value))
-        if rank >= world:
+        if not isinstance(dataset, Dataset):
             raise ArgumentError(
-                "rank", expected=f"0 to {world - 1}, for {world} processes", found=str(rank)
+                "dataset",
+                expected="a carlasc.Dataset",
+                found=repr(dataset),
+                advice="for a part of one, give a slice: dataset[:100]",
             )
+        check_types(ShardSampler.__init__, locals())
+        group = sys.modules.get("torch.distributed")
+        group = group if group and group.is_available() and group.is_initialized() else None
+        if num_replicas is None:
+            num_replicas = group.get_world_size() if group else 1
+        if rank is None:
+            rank = group.get_rank() if group else 0
+        given = {
+            "seed": (seed, 0),
+            "shard": (1 if shard is None else shard, 1),
+            "window": (window, 1),
+            "num_replicas": (num_replicas, 1),
+            "rank": (rank, 0),
+            "read_ahead": (read_ahead, 0),
+        }
+        for name, (value, least) in given.items():
+            if value < least:
+                raise ArgumentError(name, expected=f"{least} or more", found=str(value))
+        if rank >= num_replicas:
+            expected = f"0 to {num_replicas - 1}, for {num_replicas} processes"
+            raise ArgumentError("rank", expected=expected, found=str(rank))
         self.dataset = dataset
         self.seed = seed
         self.epoch = 0
         before = -(-(dataset.history - 1) // _STORED_TOGETHER) * _STORED_TOGETHER
         self.shard = max(_STORED_TOGETHER, _READ_AGAIN * before) if shard is None else shard
         self.window = window
+        self.num_replicas = num_replicas
         self.rank = rank
-        self.world = world
         self.read_ahead = read_ahead
         self._shards = _number_shards(dataset, self.shard)
         self._next = 0  # first position of the next iteration
         self._begun = 0  # first position of the current iteration
         self._drawn = 0  # number of samples drawn so far by all processes
 
+    def __repr__(self) -> str:
+        names = "seed epoch shard window num_replicas rank".split()
+        values = ", ".join(f"{name}={getattr(self, name)}" for name in names)
+        return f"ShardSampler({self.dataset!r}, {values})"
+
     def __len__(self) -> int:
         """Return the number of samples per epoch of this process."""
-        return math.ceil(len(self._shards) / self.world)
+        return math.ceil(len(self._shards) / self.num_replicas)
 
     def set_epoch(self, epoch: int) -> None:
         """Set the next epoch.
@@ -161,10 +188,12 @@ class ShardSampler(_Sampler):
     def _iterate(self, epoch: int, start: int) -> Iterator[int]:
         order = self.order(epoch)
         left = order[start:]
-        mine = np.resize(left, -(-len(left) // self.world) * self.world)[self.rank :: self.world]
+        mine = np.resize(left, -(-len(left) // self.num_replicas) * self.num_replicas)[
+            self.rank :: self.num_replicas
+        ]
         with ReadAhead(self.dataset, order, self._shards, start, self.read_ahead) as ahead:
             for count, index in enumerate(mine.tolist(), 1):
-                self._drawn = min(start + count * self.world, len(order))
+                self._drawn = min(start + count * self.num_replicas, len(order))
                 ahead.draw(self._drawn)
                 yield index
 
@@ -221,6 +250,9 @@ class ShardSampler(_Sampler):
             "shard": self.shard,
             "window": self.window,
         }
+
+
+inherit(ShardSampler, "Sampler")
 
 
 def _number_shards(dataset: Dataset, length: int) -> IntArray:

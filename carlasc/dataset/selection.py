@@ -208,7 +208,7 @@ def _advice(part: str) -> str:
     )
 
 
-def common_value(values: Mapping[str, _T], what: str) -> _T:
+def common_value(values: Mapping[str, _T], what: str, advice: str = "") -> _T:
     """Return the common value of `values`, a mapping from places to values.
 
     Raises:
@@ -221,7 +221,15 @@ def common_value(values: Mapping[str, _T], what: str) -> _T:
                 other,
                 expected=f"the {what} of {place} ({value})",
                 found=str(theirs),
-                advice="select sequences with equal values with `split`, a list of names",
+                advice=" or ".join(
+                    filter(
+                        None,
+                        (
+                            advice,
+                            "select sequences with equal values with `split`, a list of names",
+                        ),
+                    )
+                ),
             )
     return value
 

@@ -40,15 +40,14 @@ def stack_scans(
             the transpose of contiguous x, y and z; None gives an empty grid.
         grid_T_scans: (T, 4, 4) transforms from the frame of each scan to the frame of the grid.
         spec: the grid.
-        what: "occupancy" marks voxels with a point, "density" counts points per voxel (at most
-            65535).
+        what: "occupancy" marks voxels with a point, "density" counts points per voxel.
         min_range_m: points nearer to their sensor than this are left out; None keeps all.
         max_range_m: points farther from their sensor than this are left out; None keeps all.
 
     Returns:
-        (T, X, Y, Z) uint8 0 or 1, or uint16 number of points per voxel.
+        (T, X, Y, Z) uint8 0 or 1, or int32 number of points per voxel.
     """
-    stack = np.zeros((len(scans), *spec.size), np.uint8 if what == "occupancy" else np.uint16)
+    stack = np.zeros((len(scans), *spec.size), np.uint8 if what == "occupancy" else np.int32)
     cells, geometry = Cells.of(spec), _geometry(spec)
     ranges = (min_range_m or 0.0, math.inf if max_range_m is None else float(max_range_m))
     rows = grid_T_scans[:, :3].reshape(-1, 12).tolist()
@@ -191,14 +190,14 @@ def _find_cells(x, y, z, count, geometry, cells):  # type: ignore[no-untyped-def
 
 @_step
 def _mark(cells, count, grid):  # type: ignore[no-untyped-def]
-    """Mark (uint8) or count (uint16) the points of each voxel."""
+    """Mark (uint8) or count (int32) the points of each voxel."""
     if grid.itemsize == 1:
         for n in range(count):
             if cells[n] >= 0:
                 grid[cells[n]] = 1
     else:
         for n in range(count):
-            if cells[n] >= 0 and grid[cells[n]] < 65535:
+            if cells[n] >= 0:
                 grid[cells[n]] += 1
 
 

@@ -17,6 +17,7 @@ UNSEEN, PASSED, HIT = 0, 1, 2
 # about the faces of the outer surface of the published grid, 36,864, so that small grids are traced
 # as densely
 _FEWEST_RAYS = 40_000
+_RIGID = 4e-4  # largest change of lengths by the rounding of poses
 
 
 def stack_visibility(
@@ -67,7 +68,14 @@ def stack_visibility(
         if limits != (0.0, math.inf):
             distance = np.linalg.norm(rays, axis=1)
             rays = rays[(distance >= limits[0]) & (distance <= limits[1])]
-        observation = Observation(rays, np.ones(len(rays), np.uint16), grid_T_scan)
+        # an observation is rigid: the scale and the reflection of an augmentation go to its points
+        scale = float(np.cbrt(np.linalg.det(grid_T_scan[:3, :3])))
+        scale = 1.0 if math.isclose(scale, 1, abs_tol=_RIGID) else scale
+        observation = Observation(
+            rays * np.float32(scale),
+            np.ones(len(rays), np.uint16),
+            grid_T_scan / np.array([scale, scale, scale, 1]),
+        )
         free = count_votes([observation], spec, free_step_m=step_m).free > 0
         grid[free & (grid == UNSEEN)] = PASSED
     return seen

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from carlasc.groundtruth.voxel_actors import ActorPoints
 from carlasc.storage import layout
 from carlasc.storage.camera_files import cameras_to_json
 from carlasc.storage.files import AnyPath
+from carlasc.storage.inputs import FrameFiles, combined, digest_of_bytes
 from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import Source
 
@@ -175,6 +176,24 @@ class CaptureSequence(SequenceInput):
         """Return cameras.json; None if the capture has no cameras."""
         return cameras_to_json(self.capture.cameras.values()) if self.capture.cameras else None
 
+    def files(self) -> FrameFiles | None:
+        """Return the files of the recordings; None if they are on no disk."""
+        capture = self.capture
+        return CaptureFiles(capture.light()) if type(capture) is Capture else None
+
+    def depended(self) -> list[int]:
+        """Return the frames of the capture, and those in which the motion of actors is read."""
+        return sorted({one for number in range(len(self.frames)) for one in self._used(number)})
+
+    def _used(self, number: int) -> tuple[int, ...]:
+        """Return the frames of the capture that a frame of the output is made from."""
+        frame = cast(CaptureFrame, self.frames[number])
+        return frame.source_frame, *(frame.around if self.plan.voting.keep_actors else ())
+
+    def made_from(self, number: int, own: Mapping[str, str], whole: str) -> str:
+        """Return a digest of the recordings of a frame."""
+        return combined([own[str(one)] for one in self._used(number)], self.shared())
+
     def record(self) -> dict[str, Any]:
         """Return the frames and the number of sensors.
 
@@ -188,6 +207,25 @@ class CaptureSequence(SequenceInput):
         elif asked.only is None:
             frames = f"{first}:{self.frames[-1].source_frame + 1}"
         return {"observe": "capture", "frames": frames, "sensors": len(self.capture.sensors)}
+
+
+class CaptureFiles(FrameFiles):
+    """The files of each frame of a capture."""
+
+    kind = "capture"
+
+    def __init__(self, capture: Capture) -> None:
+        self.capture, self.tree = capture, capture.tree
+
+    def paths(self, frame: int) -> list[str]:
+        """Return the files of all sensors and cameras."""
+        return self.capture.files_of(frame)
+
+    def contents(self, frame: int) -> Iterator[tuple[str, bytes]]:
+        """Yield the name and the digest of each file."""
+        paths = self.paths(frame)
+        for path, data in zip(paths, self.capture.tree.read_many(paths), strict=True):
+            yield path, digest_of_bytes(data)
 
 
 def capture_sequences(source: AnyPath | Source | Capture, plan: GridPlan) -> list[SequenceInput]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -25,8 +26,9 @@ from carlasc.groundtruth.inputs import (
 )
 from carlasc.groundtruth.options import FromGrid
 from carlasc.groundtruth.voting.ballot import Observation, count_votes
-from carlasc.storage import as_source
+from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath
+from carlasc.storage.inputs import FrameFiles, SequenceFiles, combined
 from carlasc.storage.protocol import Sequence, Source
 
 if TYPE_CHECKING:
@@ -151,6 +153,25 @@ class ResampledSequence(StoredSequence):
             ResampledFrame(light, self.finer, number, number)
             for number in choose_frames(self.plan.frames, available, self.location)
         )
+
+    def files(self) -> FrameFiles:
+        """Return the files of the scans and of the finer grid."""
+        fields = [f"{self.finer}/{part}" for part in ("labels", "counts")]
+        return SequenceFiles(without_caches(self.sequence), *fields)
+
+    def about(self, frame: int) -> object:
+        """Return all poses and times, if the cameras that see each voxel are kept."""
+        texts = (layout.POSES, layout.TIMES) if self.plan.needs_all else ()
+        present = self.sequence.documents()
+        return [self.sequence.read_document(text) for text in texts if text in present]
+
+    def available(self) -> Collection[int]:
+        """Return the frames with the finer grid."""
+        return frozenset(self.sequence.frames(f"{self.finer}/labels").tolist())
+
+    def made_from(self, number: int, own: Mapping[str, str], whole: str) -> str:
+        """Return a digest of the scan and the finer grid of a frame."""
+        return combined(own[str(number)], self.shared())
 
     def record(self) -> dict[str, Any]:
         """Return the name of the finer grid."""

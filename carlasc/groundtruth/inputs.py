@@ -8,8 +8,9 @@ pickles into a worker process and is read there.
 from __future__ import annotations
 
 import copy
+import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, Any, get_args
 from carlasc.core.arrays import AnyArray, FloatArray, IntArray, Uint8Array
 from carlasc.core.frames import FrameRange
 from carlasc.core.grids import Grid, GridSpec
+from carlasc.core.tables import table_to_json
 from carlasc.errors import ArgumentError, CarlascError, MissingDataError
 from carlasc.groundtruth.options import FromGrid, FromScans, Observe, Voting
 from carlasc.groundtruth.reporting import PoseFacts, Residual
@@ -27,6 +29,7 @@ from carlasc.groundtruth.voxel_actors import VoxelActors
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.camera_files import cameras_of, scan_T_camera
+from carlasc.storage.inputs import FrameFiles, SequenceFiles
 from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import Sequence, SequenceWriter
 
@@ -92,6 +95,13 @@ class GridPlan:
     def needs_evidence(self) -> bool:
         """Whether frames need the certainty of each voxel: `FrameData.evidence`."""
         return self.voting.keep_evidence or self.voting.min_confidence > 0
+
+    @property
+    def needs_all(self) -> bool:
+        """Whether a frame may depend on other frames than those that vote on it: for the motion of
+        actors, or the poses of cameras.
+        """
+        return self.voting.keep_actors or self.voting.keep_seen
 
     def fields(self) -> tuple[str, ...]:
         """Return the names of the grid's fields."""
@@ -263,6 +273,47 @@ class SequenceInput(ABC):
         """
         return None
 
+    def files(self) -> FrameFiles | None:
+        """Return the files of each frame; None if the sequence is not read from files."""
+        return None
+
+    def depended(self) -> list[int]:
+        """Return the frames of the source that the grids depend on."""
+        return [frame.source_frame for frame in self.frames]
+
+    def take_contents(self, contents: Mapping[int, str]) -> None:  # noqa: B027 (most need none)
+        """Take the digests of the files of frames, by number."""
+
+    def about(self, frame: int) -> object:
+        """Return what text files say of a frame of the source and its grids depend on."""
+        return None
+
+    def shared(self) -> object:
+        """Return what all frames depend on, besides the settings in params.json."""
+        return table_to_json(self.metadata.classes), self.cameras()
+
+    def available(self) -> Collection[int]:
+        """Return the numbers of all frames that the source can have in the output."""
+        return {frame.number for frame in self.frames}
+
+    def made_from(self, number: int, own: Mapping[str, str], whole: str) -> str:
+        """Return a digest of everything that the grid of a frame is made from, after `prepare`.
+
+        Args:
+            number: number of the frame in the output.
+            own: digest of each frame of the source, by its number.
+            whole: digest of all of these and of `shared`.
+        """
+        return whole
+
+    def written(self, writer: SequenceWriter, grid: str) -> list[str]:
+        """Return the fields that a run wrote for each frame: those of the grid, and those of scans
+        unless they are the source.
+        """
+        fields = [f"{grid}/{part}" for part in layout.GRID_FIELDS]
+        is_copy = os.path.realpath(writer.location) != os.path.realpath(self.location)
+        return [*(layout.SCAN_FIELDS if is_copy else ()), *fields]
+
     def summaries(self) -> Series[Mapping[str, Any]] | None:
         """Return the facts of each actor, by number; None if actors are not tracked."""
         return None
@@ -283,6 +334,10 @@ class StoredSequence(SequenceInput):
         self.sequence, self.plan = sequence, plan
         self.path = parent_path(sequence)
         self.location, self.metadata = sequence.location, sequence.metadata
+
+    def files(self) -> FrameFiles | None:
+        """Return the files of the scans."""
+        return SequenceFiles(without_caches(self.sequence))
 
     def _count_points(self, source_frame: int) -> int:
         sequence = self.sequence

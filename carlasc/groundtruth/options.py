@@ -14,7 +14,7 @@ import numpy as np
 from carlasc.core.choices import Complete as Complete  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import Dynamic as Dynamic  # noqa: PLC0414 (part of this module)
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError, check_choice
+from carlasc.errors import ArgumentError, check_choice, check_types
 from carlasc.groundtruth.voting.ballot import VoteRule, check_rule
 from carlasc.motion.options import MotionOptions, PoseOptions
 
@@ -70,6 +70,7 @@ class FromScans:
     max_range_m: float | None = None
 
     def __post_init__(self) -> None:
+        check_types(FromScans, vars(self))
         first, last = self.window
         if first > 0 or last < 0:
             raise ArgumentError(
@@ -117,6 +118,9 @@ class FromGrid:
 
     name: str | None = None
 
+    def __post_init__(self) -> None:
+        check_types(FromGrid, vars(self))
+
 
 Observe = FromCapture | FromScans | FromGrid
 """The type of the argument `observe` of `regrid`."""
@@ -157,6 +161,7 @@ class Voting:
     keep_seen: bool = False
 
     def __post_init__(self) -> None:
+        check_types(Voting, vars(self))
         check_rule(self.rule or "sensor", self.free_step_m)
         if not 0 <= self.min_confidence < 1:
             raise ArgumentError(

@@ -22,8 +22,8 @@ from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.core.plain import from_plain
 from carlasc.errors import FormatError, carlasc_version, reading
 from carlasc.motion.refinement import RefinedPoses
-from carlasc.storage import layout
 from carlasc.storage.files import parse_json, to_json
+from carlasc.storage.inputs import digest_of, digest_of_bytes
 
 # of one observation: points that are used, and points whose distance is measured
 _MOST_POINTS, _MOST_ASKED = (
@@ -164,7 +164,6 @@ def _distances(one: AnyFloatArray, other: AnyFloatArray) -> AnyFloatArray:
 
 POWERS = 24
 """Number of bins of the histogram of votes: 1, 2 to 3, 4 to 7, ..."""
-_DIGEST_BYTES = 16
 _DRIFT = 100  # number of scans over which a drift of the height is measured
 _SAMPLED = 40  # one of so many frames is made again without a tenth of the scans
 
@@ -318,29 +317,6 @@ def sample_frames(numbers: Sequence[int]) -> frozenset[int]:
     """
     chosen = frozenset(n for n in numbers if n % _SAMPLED == _SAMPLED // 2)
     return chosen or frozenset(numbers[len(numbers) // 2 :][:1])
-
-
-def digest_of(field: str, array: AnyArray) -> bytes:
-    """Return the digest (BLAKE2b, 16 bytes) of a field of a frame: the digest of its published
-    file, for all stores.
-
-    Votes are compressed in their file, so their digest is that of their rows.
-
-    Raises:
-        FormatError: the array does not fit the field.
-    """
-    entry = layout.field_named(field)
-    data = (
-        np.ascontiguousarray(array).tobytes()
-        if entry.kind in ("votes", "velocities")
-        else entry.encode(array, field)
-    )
-    return digest_of_bytes(data)
-
-
-def digest_of_bytes(data: bytes | memoryview) -> bytes:
-    """Return the digest (BLAKE2b, 16 bytes) of the bytes of a file."""
-    return blake2b(data, digest_size=_DIGEST_BYTES).digest()
 
 
 REPORT_FORMAT = 1

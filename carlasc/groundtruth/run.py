@@ -17,8 +17,11 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from carlasc.captures.raw import RAW, Capture, find_captures
 from carlasc.core.arrays import AnyArray
+from carlasc.core.choices import CompareInputs
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import Grid, GridSpec, is_confident
@@ -29,8 +32,11 @@ from carlasc.errors import (
     FormatError,
     MissingDataError,
     StorageError,
+    check_choice,
+    check_types,
     reading,
 )
+from carlasc.groundtruth.comparing import InputCheck
 from carlasc.groundtruth.from_capture import capture_sequences
 from carlasc.groundtruth.from_grid import resampled_sequences
 from carlasc.groundtruth.from_scans.sequences import scan_sequences
@@ -88,7 +94,7 @@ class RegridResult:
 
 def regrid(
     source: AnyPath | Source | Capture,
-    spec: GridSpec,
+    spec: GridSpec | str | float,
     out: AnyPath | Sink | None = None,
     *,
     observe: Observe | None = None,
@@ -96,21 +102,23 @@ def regrid(
     frames: Frames = None,
     name: str | None = None,
     overwrite: bool = False,
+    compare_inputs: CompareInputs = "fast",
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> RegridResult:
     """Make the ground-truth grid of every frame, and write it with its scans, flow, poses and
     times, and a report of each grid.
 
-    Frames that exist already are skipped. If they were made with other settings, the run stops
-    before it writes anything. A frame that cannot be read is reported in the result, and the other
-    frames are made. The work is done in processes that import the main module again: call this
-    under `if __name__ == "__main__":` in scripts, or with `run=Run(workers=1)`.
+    Frames that exist already are skipped, unless their scans, labels, poses or times changed since
+    then: these are made again, and a note says why. If they were made with other settings, the run
+    stops before it writes anything. A frame that cannot be read is reported in the result, and the
+    other frames are made. The work is done in processes that import the main module again: call
+    this under `if __name__ == "__main__":` in scripts, or with `run=Run(workers=1)`.
 
     Args:
         source: a sequence's folder, a folder of several sequences, or, unless it holds captures,
             anything that `carlasc.open` takes; or a `carlasc.captures.Capture`, such as a
             `SimulatedCapture`, which is on no disk.
-        spec: geometry of the grid.
+        spec: geometry of the grid, or what `GridSpec.of` takes: "coarse", or 0.2 (metres).
         out: where to write: a folder or a `.zarr` store, on this machine or in an object store; or
             any Sink. Each sequence is written to its path below `source`, then `<coordinates>/`.
             None writes into `source`.
@@ -122,6 +130,9 @@ def regrid(
             from 0.
         name: name of the grid's folder. None: a name with its size.
         overwrite: replace what an earlier run with other settings wrote.
+        compare_inputs: how it is found out whether the inputs of existing frames changed: "fast":
+            by the size and the time of each file, and by content where these differ; "content":
+            by content; "never": existing frames are kept.
         run: how the work is spread, whether this is only a part of it, and what shows its progress.
             The last part to finish writes the report, and finishes a packed store.
 
@@ -136,8 +147,11 @@ def regrid(
         StorageError: the disk is full or the output cannot be written to. Files that were written
             are complete.
     """
+    check_types(regrid, locals())
+    spec = GridSpec.of(spec)
     start = time.perf_counter()
     run.part.refuse(overwrite)
+    check_choice("compare_inputs", compare_inputs, CompareInputs)
     grid = layout.grid_folder(spec) if name is None else check_name(name)
     sink = as_sink(_folder_of(source) if out is None else out, part=run.part)
     for place in (sink.location, str(source)):
@@ -146,7 +160,8 @@ def regrid(
         spec, grid, _choose(source) if observe is None else observe, voting, FrameRange.of(frames)
     )
     jobs = [
-        _prepare(inputs, sink, plan, overwrite=overwrite) for inputs in _sequences(source, plan)
+        _prepare(inputs, sink, plan, compare_inputs, overwrite=overwrite)
+        for inputs in _sequences(source, plan)
     ]
 
     with ExitStack() as open_things:
@@ -165,7 +180,7 @@ def regrid(
             sink.finish()
 
     grids = tuple(sink.place(f"{job.path}/{grid}") for job in jobs)
-    notes = tuple(note for job in jobs for note in job.inputs.notes())
+    notes = tuple(note for job in jobs for note in (*job.check.notes, *job.inputs.notes()))
     made = work.wanted - len(failures)
     return RegridResult(
         grids, spec, made, work.skipped, tuple(failures), time.perf_counter() - start, notes
@@ -240,7 +255,9 @@ def _folder_of(source: AnyPath | Source | Capture) -> str | Path:
     )
 
 
-def _prepare(inputs: SequenceInput, sink: Sink, plan: GridPlan, *, overwrite: bool) -> SequenceJob:
+def _prepare(
+    inputs: SequenceInput, sink: Sink, plan: GridPlan, compare: CompareInputs, *, overwrite: bool
+) -> SequenceJob:
     """Compare the existing output with the plan of this run; if they differ, stop before anything
     is written.
     """
@@ -268,7 +285,9 @@ def _prepare(inputs: SequenceInput, sink: Sink, plan: GridPlan, *, overwrite: bo
         layout.params_file(plan.grid): to_json(params),
     }
     needed = {name: data for name, data in documents.items() if data is not None}
-    return SequenceJob(path, inputs, plan, writer, needed, params, replaces=exists and overwrite)
+    check = InputCheck(inputs, writer, plan.grid, compare)
+    replaces = exists and overwrite
+    return SequenceJob(path, inputs, plan, writer, needed, params, replaces, check)
 
 
 def _begin(job: SequenceJob) -> None:
@@ -319,6 +338,7 @@ class FrameTask:
         plan: the plan of the run.
         classes: class table of the grid.
         sampled: whether the frame is also made without a tenth of the scans.
+        replaces: whether scans in the output are replaced, because those of the input changed.
         existing: where the frame is; None: it is made.
     """
 
@@ -327,6 +347,7 @@ class FrameTask:
     plan: GridPlan
     classes: ClassTable
     sampled: bool
+    replaces: bool = False
     existing: SequenceWriter | None = None
 
     def run(self) -> FrameResult:
@@ -456,6 +477,7 @@ def write_frames(writer: SequenceWriter, results: Series[FrameResult]) -> None:
                 name: array
                 for name, array in done.outputs.items()
                 if name not in layout.SCAN_FIELDS
+                or done.task.replaces
                 or not (writer.has(name, number) and check_scan(writer, name, number, array))
             }
     if frames:
@@ -488,6 +510,7 @@ class SequenceJob:
     documents: dict[str, bytes]
     params: dict[str, Any]
     replaces: bool
+    check: InputCheck
 
     @cached_property
     def numbers(self) -> frozenset[int]:
@@ -520,6 +543,31 @@ class SequenceJob:
             if not all(has(name, frame.number) for name in (*frame.fields(), *grid))
         }
 
+    def look(self, run: Run) -> set[int]:
+        """Compare the inputs of the existing frames with those of now, and return the frames that
+        must be made, because they lack a file or their inputs changed.
+        """
+        missing = self.missing()
+        self.check.look(self.numbers - missing, self._agrees, run)
+        return missing | self.check.stale
+
+    def _agrees(self, number: int) -> bool | None:
+        """Return whether a frame is equal to what is made now; None if it cannot be made."""
+        (task,) = self.tasks({number})
+        made, own = task.run().outputs, f"{self.plan.grid}/"
+        fields = {name: array for name, array in made.items() if name.startswith(own)}
+        return (
+            None
+            if not fields
+            else all(
+                (there := self.writer.read(name, number)) is not None
+                and np.array_equal(
+                    there.reshape(-1), array.reshape(-1), equal_nan=array.dtype.kind == "f"
+                )
+                for name, array in fields.items()
+            )
+        )
+
     def report(self) -> Report | None:
         """Return the report of an earlier run with the same settings; None without one."""
         name = layout.report_file(self.plan.grid)
@@ -534,7 +582,8 @@ class SequenceJob:
     def reported(self) -> frozenset[int]:
         """The frames of the report: those of this run, and those of the existing report."""
         report = self.report()
-        return self.numbers if report is None else self.numbers | set(report.frames)
+        earlier = set() if report is None else set(report.frames) - self.check.gone
+        return self.numbers | earlier
 
     def tasks(self, numbers: Set[int], existing: SequenceWriter | None = None) -> list[FrameTask]:
         """Return a task for each of some frames; `existing`: where they are already."""
@@ -547,6 +596,7 @@ class SequenceJob:
                 self.plan,
                 inputs.metadata.classes,
                 number in sampled,
+                number in self.check.replaced,
                 existing,
             )
             for number in sorted(numbers)
@@ -602,7 +652,8 @@ class Work:
         frames of one are made.
         """
         dealt = self._deal()
-        ours = [job.missing() & numbers for job, numbers in zip(self.jobs, dealt, strict=True)]
+        every = [job.look(self.spread) for job in self.jobs]
+        ours = [todo & numbers for todo, numbers in zip(every, dealt, strict=True)]
         self.wanted = sum(map(len, ours))
         self.skipped = sum(map(len, dealt)) - self.wanted
         passes = sum(
@@ -613,9 +664,10 @@ class Work:
         under_way: deque[SequenceJob] = deque()  # the job of each batch, in order
 
         def batches() -> Iterator[Batch]:
-            for job, missing in zip(self.jobs, ours, strict=True):
+            for job, todo, missing in zip(self.jobs, every, ours, strict=True):
                 if missing:
-                    job.inputs.prepare(job.writer, self.spread, steps)
+                    job.check.prepare(self.spread, steps)
+                    job.check.begin(job.numbers, todo)
                 for batch in _batches(job, job.tasks(missing)):
                     under_way.append(job)
                     yield batch
@@ -652,14 +704,19 @@ class Work:
             if done.task.frame is not None and done.error is not None:
                 frame = done.task.frame.source_frame
                 self.failures.append(FrameFailure(job.inputs.location, frame, done.error))
-        report = job.report()
+        report, tried = job.report(), {done.task.number for done in made}
         is_reported = report is not None and set(report.frames) >= job.numbers
-        if (not made and is_reported) or (self.spread.part.count > 1 and job.missing()):
-            return
-        if not made:
-            job.inputs.prepare(job.writer, self.spread, StepCounter(None))
+        is_reported &= not made and not job.check.changed
+        if not (is_reported or (self.spread.part.count > 1 and job.missing())):
+            self._report(job, made, tried)
+        if made or job.check.must_record:
+            job.check.begin(job.numbers, ())  # if no frame was made
+            job.check.finish({done.task.number for done in made if done.error is None})
+
+    def _report(self, job: SequenceJob, made: list[FrameResult], tried: Set[int]) -> None:
+        """Write the report of a sequence."""
+        job.check.prepare(self.spread, StepCounter(None))
         self.has_written = True
-        tried = {done.task.number for done in made}
         measured = _batches(job, job.tasks(job.reported - tried, job.writer))
         with closing(run_all(run_batch, measured, self.spread, lost=fail_batch)) as results:
             job.write_report([*made, *(done for batch in results for done in batch)])

@@ -16,7 +16,8 @@ import numpy as np
 from carlasc.captures.raw import Capture, find_captures
 from carlasc.core.arrays import IntArray
 from carlasc.core.notebook import data_frame
-from carlasc.errors import CarlascError, MissingDataError, without_credentials
+from carlasc.errors import CarlascError, MissingDataError, check_types, without_credentials
+from carlasc.inspection.staleness import changed_inputs
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath
 from carlasc.storage.folder import FolderSequence
@@ -43,6 +44,8 @@ class GridOverview:
         frames: number of frames.
         parts: which of labels, counts and votes exist.
         made: the record of how the grid was made; None for published data.
+        stale: what changed of its inputs since it was made; empty if nothing is known to have
+            changed.
     """
 
     name: str
@@ -54,6 +57,7 @@ class GridOverview:
     frames: int
     parts: tuple[str, ...]
     made: Mapping[str, Any] | None
+    stale: str = ""
 
 
 @dataclass(frozen=True)
@@ -167,6 +171,7 @@ def info(source: AnyPath | Source) -> Overview:
     Raises:
         MissingDataError: the source holds neither a sequence nor a capture.
     """
+    check_types(info, locals())
     captures: dict[str, Capture] = {}
     if not isinstance(source, Source):
         with suppress(MissingDataError):
@@ -254,6 +259,7 @@ def _describe_grid(sequence: Sequence, name: str, fields: Mapping[str, int]) -> 
         fields.get(f"{name}/labels", 0),
         parts,
         sequence.params(name).get("carlasc"),
+        changed_inputs(sequence, name),
     )
 
 

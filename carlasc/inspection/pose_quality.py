@@ -280,11 +280,24 @@ def _check_steps(sequence: Sequence, frames: IntArray, where: str) -> Iterator[F
     # frames of a cloud without a sensor have no order in time
     if len(frames) < 2 or not sequence.metadata.has_rays:
         return
-    steps = invert(poses[:-1]) @ poses[1:]
     try:
-        period_s = np.diff([sequence.read_time(frame) for frame in frames.tolist()])
+        seconds = np.array([sequence.read_time(frame) for frame in frames.tolist()])
     except CarlascError:
-        period_s = np.zeros(1)
+        seconds = np.zeros(len(frames))
+    if found := describe_jumps(frames, poses, seconds):
+        advice = "check whether frames are missing there, or sequences were joined"
+        yield Finding("error", "pose-jump", where, "poses without jumps", found, advice)
+
+
+def describe_jumps(frames: IntArray, poses: FloatArray, seconds: FloatArray) -> str:
+    """Return where poses jump as no carrier of a sensor moves; empty if they do not.
+
+    Args:
+        frames: (F,) increasing frame numbers.
+        poses: (F, 4, 4) their poses.
+        seconds: (F,) their times; if they do not increase, frames at 10 Hz are taken.
+    """
+    steps, period_s = invert(poses[:-1]) @ poses[1:], np.diff(seconds)
     if not (period_s > 0).all():  # which is reported elsewhere
         period_s = np.diff(frames) * layout.FRAME_PERIOD_S
     moved_m, turned = np.linalg.norm(steps[:, :3, 3], axis=1), angles_of(steps)
@@ -294,13 +307,12 @@ def _check_steps(sequence: Sequence, frames: IntArray, where: str) -> Iterator[F
     jumps = np.flatnonzero(
         (speed > _SPEED_M_S) | (strange > _SPEED_CHANGE_M_S) | (turn > _TURN_RAD_S)
     )
-    if len(jumps):
-        step = int(jumps[np.argmax(strange[jumps] + turn[jumps])])
-        found = (
-            f"{moved_m[step]:.2f} m and {np.rad2deg(turned[step]):.1f} degrees from frame "
-            f"{frames[step]} to {frames[step + 1]}, {usual[step] * period_s[step]:.2f} m between "
-            "other frames"
-        )
-        found += f" ({len(jumps)} such steps)" if len(jumps) > 1 else ""
-        advice = "check whether frames are missing there, or sequences were joined"
-        yield Finding("error", "pose-jump", where, "poses without jumps", found, advice)
+    if not len(jumps):
+        return ""
+    step = int(jumps[np.argmax(strange[jumps] + turn[jumps])])
+    found = (
+        f"{moved_m[step]:.2f} m and {np.rad2deg(turned[step]):.1f} degrees from frame "
+        f"{frames[step]} to {frames[step + 1]}, {usual[step] * period_s[step]:.2f} m between "
+        "other frames"
+    )
+    return found + (f" ({len(jumps)} such steps)" if len(jumps) > 1 else "")

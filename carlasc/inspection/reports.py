@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 from carlasc.core.frames import FrameRange
-from carlasc.errors import ArgumentError, CarlascError, ConflictError, MissingDataError
+from carlasc.errors import ArgumentError, CarlascError, ConflictError, MissingDataError, check_types
 from carlasc.groundtruth import FrameFailure, FromScans, Voting
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
 from carlasc.groundtruth.inputs import FrameInput, GridPlan, without_caches
@@ -82,6 +82,7 @@ def report(
         ArgumentError: `save` with a source that is not a folder.
         ConflictError: `save` with a grid that carlasc did not make.
     """
+    check_types(report, locals())
     opened = as_source(source)
     grids = [
         (path, sequence, name)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -10,16 +12,18 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from carlasc.core.arrays import IntArray
-from carlasc.core.classes import ClassTable, Remap, class_weights
+from carlasc.core.classes import ClassTable, Remap, TableUse, class_weights
 from carlasc.core.notebook import data_frame
-from carlasc.core.tables import benchmark_remap, remap_named, remaps_between, to_table
-from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
+from carlasc.core.tables import benchmark_remap, remaps_between, to_table
+from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError, check_types
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
+from carlasc.storage.class_files import read_remap
 from carlasc.storage.files import AnyPath
 from carlasc.storage.layout import EVALUATION
 from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.voxel_files import VoxelSequence
 
 if TYPE_CHECKING:
     import pandas
@@ -43,6 +47,8 @@ class Histogram:
         grids: number of grids counted.
         actor_voxels: number of voxels that belong to an actor, in grids with the field `actors`.
         moving_voxels: number of voxels that move, in grids with the field `actors`.
+        unlisted: number of points and voxels by id that is no class, which are not in `points` and
+            `voxels`.
     """
 
     points: IntArray
@@ -52,6 +58,7 @@ class Histogram:
     grids: int = 0
     actor_voxels: int = 0
     moving_voxels: int = 0
+    unlisted: Counter[int] = dataclasses.field(default_factory=Counter)
 
     @classmethod
     def empty(cls, classes: ClassTable) -> Histogram:
@@ -85,6 +92,7 @@ class Statistics:
         sequences: the histogram of each sequence, by its path.
         splits: the split of each sequence, by its path; "none" if the path names no split.
         failures: (file, message) of the frames that could not be read.
+        uses: the class tables of the labels, and what named them.
     """
 
     location: str
@@ -93,6 +101,7 @@ class Statistics:
     sequences: dict[str, Histogram]
     splits: dict[str, str]
     failures: tuple[tuple[str, str], ...] = ()
+    uses: tuple[TableUse, ...] = ()
 
     @property
     def total(self) -> Histogram:
@@ -164,12 +173,14 @@ class Statistics:
             return figures | {
                 "unknown_voxels": histogram.unknown,
                 **{name: getattr(histogram, name) for name in _COUNTED},
+                "unlisted": {str(i): n for i, n in sorted(histogram.unlisted.items())},
                 "known_share": None if np.isnan(share) else share,
             }
 
         return {
             "location": self.location,
             "classes": self.classes.name,
+            "source_classes": [vars(use) for use in self.uses],
             "remap": self.remap.name if self.remap else None,
             "total": plain(self.total),
             "splits": {split: plain(histogram) for split, histogram in self.by_split().items()},
@@ -185,6 +196,7 @@ def stats(
     grid: str = EVALUATION,
     remap: str | Remap | None = "auto",
     every: int = 1,
+    allow_unknown: bool = False,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> Statistics:
     """Count the classes of points and of a grid's known voxels, frame by frame.
@@ -192,9 +204,12 @@ def stats(
     Args:
         source: a path or URL that `carlasc.open` knows, or a Source.
         grid: grid whose voxels are counted. A sequence that has only one grid uses that one.
-        remap: the remap to the classes of a second table: a remap or its name, None for no second
-            table, or "auto", which takes the paper's 11 classes or SemanticKITTI's 19.
+        remap: the remap to the classes of a second table: a remap, its name, or a JSON or YAML file
+            of classes with a map, None for no second table, or "auto", which takes the paper's 11
+            classes or SemanticKITTI's 19.
         every: count only every N-th frame.
+        allow_unknown: count points and voxels whose id is no class apart, instead of listing their
+            frames as failures.
         run: how the work is spread, with a callback for progress.
 
     Returns:
@@ -205,6 +220,7 @@ def stats(
         FormatError: the sequences have different class tables, or the remap is of another table.
         MissingDataError: there is no data set, or it has no labels.
     """
+    check_types(stats, locals())
     if every < 1:
         raise ArgumentError("every", expected="1 or more", found=str(every))
     opened = as_source(source)
@@ -219,7 +235,7 @@ def stats(
     histograms = {path: Histogram.empty(classes) for path in sequences}
     failures: list[tuple[str, str]] = []
     counted = run_all(
-        partial(_count, classes=classes),
+        partial(_count, classes=classes, allow_unknown=allow_unknown),
         tasks,
         run,
         lost=lambda task, message: (Histogram.empty(classes), _failures(task, message)),
@@ -229,7 +245,10 @@ def stats(
         failures += failed
         step(len(frames))
     splits = {path: sequence.split or "none" for path, sequence in sequences.items()}
-    return Statistics(opened.location, classes, chosen, histograms, splits, tuple(failures))
+    uses = {sequence.table_use(field.rpartition("/")[0]) for sequence, field, _ in tasks}
+    return Statistics(
+        opened.location, classes, chosen, histograms, splits, tuple(failures), tuple(sorted(uses))
+    )
 
 
 # a sequence, a field with classes, some of its frames
@@ -238,23 +257,25 @@ _Task = tuple[Sequence, str, tuple[int, ...]]
 
 def _tasks(sequence: Sequence, grid: str, every: int) -> list[_Task]:
     grids = sequence.grids
-    if grid not in grids and len(grids) == 1:
+    if grid not in grids and (len(grids) == 1 or isinstance(sequence, VoxelSequence)):
         grid = next(iter(grids))
     tasks: list[_Task] = []
-    for field in ("labels", f"{grid}/labels"):
-        frames = sequence.frames(field)[::every].tolist() if field in sequence.fields() else []
+    for name in ("labels", f"{grid}/labels"):
+        frames = sequence.frames(name)[::every].tolist() if name in sequence.fields() else []
         tasks += [
-            (sequence, field, tuple(frames[i : i + _CHUNK])) for i in range(0, len(frames), _CHUNK)
+            (sequence, name, tuple(frames[i : i + _CHUNK])) for i in range(0, len(frames), _CHUNK)
         ]
     return tasks
 
 
-def _count(task: _Task, classes: ClassTable) -> tuple[Histogram, list[tuple[str, str]]]:
+def _count(
+    task: _Task, classes: ClassTable, allow_unknown: bool
+) -> tuple[Histogram, list[tuple[str, str]]]:
     """Count the classes of some frames; runs in a worker."""
     histogram, failures = Histogram.empty(classes), []
     for frame in task[2]:
         try:
-            histogram += _count_frame(*task[:2], frame, classes)
+            histogram += _count_frame(*task[:2], frame, classes, allow_unknown)
         except CarlascError as error:
             failures += _failures((*task[:2], (frame,)), str(error))
     return histogram, failures
@@ -265,25 +286,32 @@ def _failures(task: _Task, message: str) -> list[tuple[str, str]]:
     return [(f"{sequence.path} {field} {frame:06d}", message) for frame in frames]
 
 
-def _count_frame(sequence: Sequence, field: str, frame: int, classes: ClassTable) -> Histogram:
+def _count_frame(
+    sequence: Sequence, field: str, frame: int, classes: ClassTable, allow_unknown: bool
+) -> Histogram:
     where, stored = f"{sequence.location}: {field} of frame {frame}", _table_of(sequence, field)
     labels = sequence.read(field, frame)
+    labels, unlisted = labels.reshape(-1), Counter[int]()
+    listed = np.ones(labels.shape, np.bool_)
+    if allow_unknown and (others := stored.unknown(labels)):
+        listed, unlisted = ~np.isin(labels, list(others)), Counter(others)
+        labels = np.where(listed, labels, 0)
     stored.check(labels, where)
-    labels, unknown = to_table(labels, stored, classes, where).reshape(-1), 0
+    labels, unknown = to_table(labels, stored, classes, where), 0
     histogram, grid = Histogram.empty(classes), field.removesuffix("labels")
     if not grid:
-        points = np.bincount(labels, minlength=classes.num_channels)
-        return replace(histogram, points=points, scans=1)
+        points = np.bincount(labels[listed], minlength=classes.num_channels)
+        return replace(histogram, points=points, scans=1, unlisted=unlisted)
     if f"{grid}counts" in sequence.fields():
         known = sequence.read(f"{grid}counts", frame).reshape(-1) > 0
-        labels, unknown = labels[known], int(np.count_nonzero(~known))
+        listed, unknown = listed & known, int(np.count_nonzero(~known))
     who = list[int]()
     for part in layout.ACTOR_FIELDS:
         has = f"{grid}{part}" in sequence.fields() and frame in sequence.frames(f"{grid}{part}")
         array = sequence.read(f"{grid}{part}", frame) if has else np.empty(0, np.uint8)
         who.append(len(array) if part == "velocity" else int(np.count_nonzero(array)))
-    voxels = np.bincount(labels, minlength=classes.num_channels)
-    return Histogram(histogram.points, voxels, unknown, 0, 1, *who)
+    voxels = np.bincount(labels[listed], minlength=classes.num_channels)
+    return Histogram(histogram.points, voxels, unknown, 0, 1, who[0], who[1], unlisted)
 
 
 def _table_of(sequence: Sequence, field: str) -> ClassTable:
@@ -322,7 +350,7 @@ def _choose_remap(remap: str | Remap | None, classes: ClassTable) -> Remap | Non
         return None
     if remap == "auto":
         return benchmark_remap(classes)
-    chosen = remap_named(remap) if isinstance(remap, str) else remap
+    chosen = read_remap(remap) if isinstance(remap, str) else remap
     if chosen.source.name != classes.name:
         raise FormatError(
             f"remap {chosen.name}", expected=f"labels of {chosen.source.name}", found=classes.name

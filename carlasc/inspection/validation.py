@@ -14,10 +14,10 @@ import numpy as np
 from carlasc.core.arrays import Float32Array, FloatArray, LabelArray
 from carlasc.core.geometry import check_rigid
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError, CarlascError
+from carlasc.errors import ArgumentError, CarlascError, check_types
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.options import FromScans
-from carlasc.groundtruth.reporting import Report, digest_of, short
+from carlasc.groundtruth.reporting import Report, short
 from carlasc.inspection.agreement import GridDiagnosis, GridEvidence, GroundBelow, check_actors
 from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses, static_structure
 from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values
@@ -30,12 +30,14 @@ from carlasc.inspection.findings import (
 )
 from carlasc.inspection.image_alignment import compare_images, judge_images
 from carlasc.inspection.pose_quality import check_poses, check_times, describe_mounting
+from carlasc.inspection.staleness import check_inputs
 from carlasc.motion.ground import ground_of
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath
 from carlasc.storage.folder import FolderSequence
+from carlasc.storage.inputs import digest_of
 from carlasc.storage.protocol import Sequence, Source
 
 _ADVICE = (
@@ -145,6 +147,7 @@ def validate(
         ArgumentError: `every` is less than 1.
         MissingDataError: there is no data set.
     """
+    check_types(validate, locals())
     if every is not None and every < 1:
         raise ArgumentError("every", expected="1 or more", found=str(every))
     opened = as_source(source)
@@ -219,6 +222,7 @@ def _examine(plan: _CheckedFrames, step: Callable[[], None] = lambda: None) -> _
         step()
     if described:
         findings.extend(check_reports(sequence, plan.read))
+        findings.extend(check_inputs(sequence))
     shares = {}
     for name, grid in evidence.items():
         diagnosis = grid.diagnose()

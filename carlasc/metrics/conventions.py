@@ -16,15 +16,22 @@ import numpy as np
 from carlasc.core.arrays import AnyArray, BoolArray, LabelArray, Uint8Array
 from carlasc.core.benchmarks import (
     IGNORED,
-    OCC3D,
     OCC3D_TO_OPENOCCUPANCY,
-    OPENOCCUPANCY,
-    SSCBENCH,
     TO_OCC3D,
     TO_SSCBENCH,
 )
-from carlasc.core.classes import ClassTable
-from carlasc.core.tables import CARLA, CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
+from carlasc.core.classes import ClassTable, Remap, tables_with, times
+from carlasc.core.tables import (
+    CARLA,
+    CARLASC11,
+    OCC3D,
+    OCCNET,
+    OPENOCCUPANCY,
+    REMAPS,
+    SEMANTICKITTI,
+    SEMANTICKITTI19,
+    SSCBENCH,
+)
 from carlasc.errors import FormatError, check_choice
 from carlasc.metrics.confusion import ConfusionMatrix
 
@@ -110,6 +117,8 @@ class Convention:
                 expected=f"a class table with a map in the convention {self.name} "
                 f"({', '.join(self.maps)})",
                 found=table.name,
+                advice="give the classes of the predictions as a file with a `map` from the ids of "
+                "the ground truth, or score the data's own classes with `convention=own`",
             )
 
     def prepare(
@@ -118,6 +127,7 @@ class Convention:
         truth: tuple[AnyArray, ClassTable],
         known: BoolArray | None,
         region: BoolArray | None = None,
+        allow_unknown: bool = False,
     ) -> tuple[LabelArray, LabelArray, BoolArray]:
         """Convert the labels of a frame to the scored classes.
 
@@ -127,6 +137,8 @@ class Convention:
             known: known voxels of the ground truth, bool, with the same number of elements; None
                 for all.
             region: voxels to score, bool, with the same number of elements; None for all.
+            allow_unknown: ids without a class are not scored in the ground truth, and free in
+                predictions, instead of an error.
 
         Returns:
             Predicted and true labels in the scored classes, and the mask of scored voxels.
@@ -135,7 +147,7 @@ class Convention:
             FormatError: an id has no target.
         """
         pred, true = (
-            self._map(labels, table, name)
+            self._map(labels, table, name, allow_unknown)
             for (labels, table), name in ((prediction, "prediction"), (truth, "truth"))
         )
         counted = true != _LEFT_OUT
@@ -168,6 +180,8 @@ class Convention:
             values = iou
         else:
             values = iou[in_truth] if self.absent == "skip-truth" else iou[~np.isnan(iou)]
+        if not matrix.total:
+            values = np.empty(0)
         occupied = matrix.completeness()
         names = [self.classes.names[index] for index in self.averaged]
         return ConventionScore(
@@ -177,20 +191,43 @@ class Convention:
             false_free=1 - occupied.recall,
         )
 
-    def _map(self, labels: AnyArray, table: ClassTable, where: str) -> Uint8Array:
-        lookup = self._lookups[table.name]
+    def unknown_ids(self, labels: AnyArray, table: ClassTable) -> dict[int, int]:
+        """Return the ids in labels of a table, of any shape, for which the convention has no class,
+        with their numbers of occurrences.
+        """
+        wrong = labels[self._look_up(labels, table) == _UNKNOWN]
+        return dict(zip(*(x.tolist() for x in np.unique(wrong, return_counts=True)), strict=True))
+
+    def _look_up(self, labels: AnyArray, table: ClassTable) -> Uint8Array:
         # the last entry is for all larger ids
-        ids = lookup.take(labels.astype(np.uint32, copy=False), mode="clip")
+        ids = labels.astype(np.uint32, copy=False)
+        return self._lookups[table.name].take(ids, mode="clip")
+
+    def _map(self, labels: AnyArray, table: ClassTable, where: str, allow: bool) -> Uint8Array:
+        ids = self._look_up(labels, table)
         if (unknown := ids == _UNKNOWN).any():
-            bad = int(labels[unknown][0])
-            raise FormatError(
-                where,
-                expected=f"class ids of {table.name}",
-                found=f"{bad} ({int(np.count_nonzero(labels == bad))} times)",
-                advice=f"the convention {self.name} has no class for this id: correct the labels, "
-                f"or use another convention",
-            )
+            if not allow:
+                found = times(self.unknown_ids(labels, table))
+                advice = self._advice(set(np.unique(labels).tolist()), table, where)
+                expected = f"class ids of {table.name}"
+                raise FormatError(where, expected=expected, found=found, advice=advice)
+            ids[unknown] = _LEFT_OUT
         return ids
+
+    def _advice(self, ids: set[int], table: ClassTable, side: str) -> str:
+        """Return what to do about ids that are not in a table: the tables that have all of them,
+        that of the benchmark first.
+        """
+        usual = (self.classes, self.usual_truth, self.usual_prediction)
+        others = [t for t in (*usual, *tables_with(ids, table)) if t != table]
+        names = [t.name for t in others if t.name in self.maps and ids <= {*self.maps[t.name]}]
+        allow = "`allow_unknown=True` counts such voxels without scoring them"
+        if not names:
+            return f"correct the labels; {allow}"
+        if side == "prediction":
+            return f"if they are ids of {names[0]}, give `source_classes={names[0]}`; {allow}"
+        write = f'{{"format": 2, "classes": "{names[0]}"}}'
+        return f"if they are ids of {names[0]}, write {write} to carlasc.json; {allow}"
 
     @cached_property
     def _lookups(self) -> dict[str, Uint8Array]:
@@ -213,19 +250,30 @@ def convention_named(name: str) -> Convention:
     return CONVENTIONS[name]
 
 
-def own_convention(table: ClassTable, *, free: int = 0) -> Convention:
+def own_convention(
+    table: ClassTable, *, free: int | None = None, remap: Remap | None = None
+) -> Convention:
     """Return a convention that scores the unchanged ids of a class table: known voxels, and the
-    mean over all classes, including free.
+    mean over all classes that occur, including free.
+
+    Args:
+        table: the scored classes.
+        free: id of free space; None takes that of the table.
+        remap: map from the ids of another table, whose labels can then be scored too.
     """
+    maps = {table.name: _identity(table)}
+    if remap is not None:
+        maps[remap.source.name] = dict(remap.mapping)
     return Convention(
         "own",
         f"the data's own classes ({table.name})",
         table,
-        free,
+        table.free if free is None else free,
         tuple(sorted(table.names)),
-        {table.name: _identity(table)},
+        maps,
         table,
         table,
+        absent="skip",
         notes="Scores of other data sets cannot be compared with this one.",
     )
 
@@ -245,16 +293,33 @@ def _via(first: Mapping[int, int], second: Mapping[int, int]) -> dict[int, int]:
     return {old: IGNORED if new == IGNORED else second[new] for old, new in first.items()}
 
 
+_FROM_OCCNET = {i: OPENOCCUPANCY.id_of(name) for i, name in OCCNET.names.items() if i < 16}
 _RAW_TO_19 = _without_zero(REMAPS["semantickitti19"].mapping)
 _CARLA_TO_RAW = REMAPS["carla_to_semantickitti"].mapping
 _CARLASC11_TO_19 = {0: 0, 1: 13, 2: 14, 3: IGNORED, 4: 6, 5: 18, 6: 9, 7: 17, 8: 11, 9: 15, 10: 1}
+_OPENOCCUPANCY = Convention(
+    "openoccupancy",
+    "OpenOccupancy-nuScenes",
+    OPENOCCUPANCY,
+    0,
+    tuple(range(1, 17)),
+    {name: _via(mapping, OCC3D_TO_OPENOCCUPANCY) for name, mapping in TO_OCC3D.items()}
+    | {"openoccupancy": _identity(OPENOCCUPANCY) | {255: IGNORED}}
+    | {"occnet": _FROM_OCCNET | {16: 0, 255: IGNORED}},
+    OPENOCCUPANCY,
+    OPENOCCUPANCY,
+    unknown="free",
+    absent="nan",
+    notes="The benchmark has no mask: an unobserved voxel counts as empty, and an "
+    "absent class makes the mean NaN.",
+)
 _OCC3D_LIDAR = Convention(
     "occ3d-lidar",
     "Occ3D-nuScenes, voxels that the LiDAR observed",
     OCC3D,
     17,
     tuple(range(17)),
-    TO_OCC3D,
+    dict(TO_OCC3D) | {"occ3d": _identity(OCC3D) | {255: IGNORED}},
     OCC3D,
     OCC3D,
     absent="skip",
@@ -275,6 +340,9 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 {
                     "carla": REMAPS["carlasc11"].mapping,
                     "carlasc11": _identity(CARLASC11),
+                    "carla0.9.14": _via(
+                        REMAPS["carla0914_to_carla"].mapping, REMAPS["carlasc11"].mapping
+                    ),
                     "semantickitti": _via(
                         REMAPS["semantickitti_to_carla"].mapping, REMAPS["carlasc11"].mapping
                     ),
@@ -291,7 +359,11 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 tuple(range(1, 20)),
                 {
                     "semantickitti": _RAW_TO_19,
-                    "semantickitti19": _identity(SEMANTICKITTI19),
+                    "semantickitti19": _identity(SEMANTICKITTI19) | {255: IGNORED},
+                    "carla0.9.14": _without_zero(
+                        _via(REMAPS["carla0914_to_carla"].mapping, _via(_CARLA_TO_RAW, _RAW_TO_19))
+                    )
+                    | {0: 0, 11: 0, 23: 0},
                     "carla": _without_zero(_via(_CARLA_TO_RAW, _RAW_TO_19)) | {13: 0, 21: 0},
                     "carlasc11": _CARLASC11_TO_19,
                 },
@@ -306,7 +378,7 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 SSCBENCH,
                 0,
                 tuple(range(1, 19)),
-                TO_SSCBENCH,
+                dict(TO_SSCBENCH) | {"sscbench": _identity(SSCBENCH) | {255: IGNORED}},
                 SEMANTICKITTI,
                 SEMANTICKITTI,
                 epsilon=1e-5,
@@ -329,20 +401,20 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 notes="This score needs grids with the field `seen`, which voxels a camera "
                 "observed.",
             ),
-            Convention(
-                "openoccupancy",
-                "OpenOccupancy-nuScenes",
-                OPENOCCUPANCY,
-                0,
-                tuple(range(1, 17)),
-                {name: _via(mapping, OCC3D_TO_OPENOCCUPANCY) for name, mapping in TO_OCC3D.items()}
-                | {"openoccupancy": _identity(OPENOCCUPANCY) | {255: IGNORED}},
-                OPENOCCUPANCY,
-                OPENOCCUPANCY,
-                unknown="free",
-                absent="nan",
-                notes="The benchmark has no mask: an unobserved voxel counts as empty, and an "
-                "absent class makes the mean NaN.",
+            _OPENOCCUPANCY,
+            replace(
+                _OPENOCCUPANCY,
+                name="surroundocc",
+                title="SurroundOcc-nuScenes",
+                notes="The rules of OpenOccupancy on another grid: noise does not count.",
+            ),
+            replace(
+                _OPENOCCUPANCY,
+                name="occnet",
+                title="OccNet and OpenScene, voxels",
+                usual_truth=OCCNET,
+                usual_prediction=OCCNET,
+                notes="The 16 classes of OpenOccupancy; its challenge takes RayIoU (--rays).",
             ),
         )
     }

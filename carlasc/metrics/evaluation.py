@@ -4,23 +4,25 @@ conventions.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from copy import copy
+from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
 
 from carlasc.core.arrays import BoolArray, LabelArray
-from carlasc.core.classes import ClassTable
+from carlasc.core.classes import ClassTable, Remap, TableUse, times
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import Grid, GridSpec
-from carlasc.core.tables import CARLA, table_named
-from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
+from carlasc.core.tables import CARLA
+from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError, check_types
 from carlasc.metrics.actor_scores import ActorScores
 from carlasc.metrics.confusion import ConfusionMatrix
 from carlasc.metrics.conventions import CONVENTIONS, Convention, convention_named, own_convention
-from carlasc.metrics.grids import SeenBy, SequenceGrid
+from carlasc.metrics.grids import SequenceGrid
 from carlasc.metrics.pairs import Pair, Place, pair_grids
 from carlasc.metrics.rays import RayIoU, ray_origins
 from carlasc.metrics.regions import (
@@ -35,6 +37,9 @@ from carlasc.metrics.results import Evaluation, FrameScore
 from carlasc.metrics.scoring import Scoring
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
+from carlasc.storage.class_files import read_classes
+from carlasc.storage.files import AnyPath
+from carlasc.storage.voxel_files import IGNORED_ID, SeenBy
 
 _FrameBatch = tuple[Pair, list[int]]  # frames of one pair that a worker scores in one task
 _Known = Callable[[SeenBy], BoolArray | None]
@@ -43,6 +48,7 @@ _Known = Callable[[SeenBy], BoolArray | None]
 LabelPair = tuple[LabelArray, LabelArray, _Known]
 _DISTANCES_M, _HEIGHTS = (0, 10, 20, 30), 4  # edges and number of the bands of `by`
 _TOGETHER = 8  # frames that a worker scores in one task
+_TRIED = 4  # sequences whose first and last frames are read to find a table by its ids
 
 
 class Scorer:
@@ -52,14 +58,20 @@ class Scorer:
         self,
         convention: str | Convention | None,
         pairs: list[Pair],
-        source_classes: str | None,
+        source_classes: AnyPath | ClassTable | None,
         scoring: Scoring,
     ) -> None:
         self.scoring = scoring
         self.impossible: CarlascError | None = None
-        self.convention = _resolve(convention, pairs)
-        given = None if source_classes is None else table_named(source_classes)
+        given, remap = (
+            (None, None)
+            if source_classes is None
+            else read_classes(source_classes, "source_classes")
+        )
+        self.convention = _resolve(convention, pairs, given, remap)
+        self.found = None if given is not None else _find_by_ids(pairs, self.convention)
         self.tables: dict[str, tuple[ClassTable, ClassTable]] = {}
+        self.uses: tuple[set[TableUse], set[TableUse]] = (set(), set())
         try:
             for pair in pairs:
                 self.tables[pair.truth.path] = self._check(pair, given)
@@ -72,6 +84,7 @@ class Scorer:
         classes, free = self.convention.num_classes, self.convention.free
         self.matrices = {path: self._matrix() for path in self.tables}
         self.failures: list[tuple[str, str]] = []
+        self.unknown: dict[str, Counter[int]] = {"prediction": Counter(), "truth": Counter()}
         self.frames: list[FrameScore] = []
         self.breakdown = Breakdown(classes, free=free)
         self.rays = RayIoU(classes, free=free) if self.scoring.rays else None
@@ -89,6 +102,8 @@ class Scorer:
             self.matrices[path] += matrix
         self.failures += other.failures
         self.frames += other.frames
+        for side, ids in other.unknown.items():
+            self.unknown[side] += ids
         self.breakdown.merge(other.breakdown)
         if self.rays is not None and other.rays is not None:
             self.rays.merge(other.rays)
@@ -126,11 +141,33 @@ class Scorer:
             self.scoring.voxels,
             self.failures,
             tuple(self.frames),
-            notes,
+            (*notes, *self._notes(summed)),
             self.breakdown.compute(),
             None if self.rays is None else self.rays.compute(),
             None if self.actors is None else self.actors.compute(),
+            tuple(sorted(self.uses[0])),
+            tuple(sorted(self.uses[1])),
+            {side: dict(sorted(ids.items())) for side, ids in self.unknown.items() if ids},
         )
+
+    def _notes(self, summed: ConfusionMatrix) -> Iterator[str]:
+        """Yield remarks about ids without a class, and about predictions that seem to have other
+        ids than those of their assumed table.
+        """
+        for side, become in (("prediction", "count as free"), ("truth", "are not scored")):
+            if ids := self.unknown[side]:
+                yield (
+                    f"{sum(ids.values())} voxels of the {side} have ids that are no class and "
+                    f"{become}: {times(dict(sorted(ids.items())))}"
+                )
+        guessed = [use.table for use in sorted(self.uses[0]) if use.found in ("assumed", "ids")]
+        predicted, true = (np.flatnonzero(summed.counts.sum(axis=axis)) for axis in (0, 1))
+        if guessed and len(predicted) and len(true) and predicted[-1] < true[-1]:
+            yield (
+                f"the ids of the predictions end at {predicted[-1]}, those of the ground truth at "
+                f"{true[-1]}, in the classes {self.convention.classes.name}: if the predictions "
+                f"are not in {guessed[0]}, name their table (`source_classes`)"
+            )
 
     def _matrix(self) -> ConfusionMatrix:
         return ConfusionMatrix(self.convention.num_classes, free=self.convention.free)
@@ -141,8 +178,13 @@ class Scorer:
         """
         truth = pair.truth.classes or self.convention.usual_truth
         prediction = given or pair.prediction.classes or self.convention.usual_prediction
+        how = "option" if given is not None else pair.prediction.named
+        if how == "assumed" and self.found is not None:
+            prediction, how = self.found, "ids"
         self.convention.check(truth, pair.truth.location)
         self.convention.check(prediction, pair.prediction.location)
+        self.uses[0].add(TableUse(prediction.name, how))
+        self.uses[1].add(TableUse(truth.name, pair.truth.named))
         needs_seen = self.convention.seen_by == "camera" or "seen" in self.scoring.by
         if needs_seen and pair.truth.known(int(pair.truth.frames()[0]), "camera") is None:
             raise MissingDataError(
@@ -170,11 +212,16 @@ class Scorer:
                     found="a region" if argument == "region" else str(asked),
                     advice=f"add params.json to {pair.truth.location}",
                 )
-        if (self.scoring.rays or "motion" in self.scoring.by) and not isinstance(
-            pair.truth, SequenceGrid
-        ):
+        if self.scoring.rays and pair.truth.origin is None:
             raise ArgumentError(
-                "rays" if self.scoring.rays else "by",
+                "rays",
+                expected="ground truth with the position of the sensor: poses.txt, or files of a "
+                "benchmark",
+                found=f"none in {pair.truth.location}",
+            )
+        if "motion" in self.scoring.by and not isinstance(pair.truth, SequenceGrid):
+            raise ArgumentError(
+                "by",
                 expected="a data set with poses and scans as ground truth",
                 found="files of grids",
             )
@@ -187,8 +234,17 @@ class Scorer:
         if self.scoring.region is not None and spec is not None:
             region = self.scoring.region(spec).reshape(truth.shape)
         try:
+            if self.scoring.allow_unknown:
+                for name, labels, table in zip(
+                    self.unknown, (prediction, truth), tables, strict=True
+                ):
+                    self.unknown[name].update(self.convention.unknown_ids(labels, table))
             pred, true, counted = self.convention.prepare(
-                (prediction, tables[0]), (truth, tables[1]), known, region
+                (prediction, tables[0]),
+                (truth, tables[1]),
+                known,
+                region,
+                self.scoring.allow_unknown,
             )
             matrix = self._matrix().update(pred, true, counted)
             if (self.scoring.by or self.scoring.rays or self.scoring.actors) and spec is not None:
@@ -198,13 +254,12 @@ class Scorer:
                     self.actors.update(pair, frame, (pred, true, counted))
                 for masks in self._masks(pair, frame, spec, true, known, tables[1]):
                     self.breakdown.update(pred, true, masks, counted)
-                if self.rays is not None and isinstance(pair.truth, SequenceGrid):
-                    # Rays begin at the sensor positions of the frames with ground truth.
-                    numbers = pair.truth.frames().tolist()
-                    poses = np.stack([pair.truth.sequence.read_pose(number) for number in numbers])
-                    self.rays.update(
-                        pred, true, spec, ray_origins(poses, numbers.index(frame), spec)
-                    )
+                if self.rays is not None and (origin := pair.truth.origin) is not None:
+                    # Rays begin at the sensor positions of the frames with ground truth, or at that
+                    # of this frame if the files have no poses.
+                    poses, row = pair.truth.poses(), pair.truth.frames().tolist().index(frame)
+                    poses, row = (np.eye(4)[None], 0) if poses is None else (poses, row)
+                    self.rays.update(pred, true, spec, ray_origins(poses, row, spec, origin))
         except (
             FormatError
         ) as error:  # add the location of prediction or ground truth to the message
@@ -259,7 +314,12 @@ class Scorer:
             )
 
 
-def _resolve(convention: str | Convention | None, pairs: list[Pair]) -> Convention:
+def _resolve(
+    convention: str | Convention | None,
+    pairs: list[Pair],
+    given: ClassTable | None,
+    remap: Remap | None,
+) -> Convention:
     if isinstance(convention, Convention):
         return convention
     tables = [
@@ -270,9 +330,41 @@ def _resolve(convention: str | Convention | None, pairs: list[Pair]) -> Conventi
     ]
     table = tables[0] if tables else CARLA
     if convention is None:
-        usual = "carlasc" if table.name in CONVENTIONS["carlasc"].maps else "own"
-        convention = pairs[0].truth.benchmark or usual
-    return own_convention(table) if convention == "own" else convention_named(convention)
+        convention = pairs[0].truth.benchmark or "carlasc"
+        if table.name not in CONVENTIONS[convention].maps:
+            convention = "own"
+        # classes of one's own, with a map from those of the ground truth
+        if (
+            given is not None
+            and given.name not in CONVENTIONS["carlasc"].maps
+            and remap is not None
+        ):
+            convention = "own"
+    if convention == "own":
+        return own_convention(table if remap is None or given is None else given, remap=remap)
+    return convention_named(convention)
+
+
+def _find_by_ids(pairs: list[Pair], convention: Convention) -> ClassTable | None:
+    """Return the usual table of predictions if no file names another one, all of their ids are in
+    it, and the ids of the ground truth go beyond it; otherwise None.
+
+    The first and the last frame of some sequences are read.
+    """
+    usual, ids = convention.usual_prediction, (set[int](), set[int]())
+    for pair in pairs[:_TRIED]:
+        if pair.prediction.named != "assumed" or pair.truth.classes == usual:
+            continue
+        common = np.intersect1d(pair.prediction.frames(), pair.truth.frames()).tolist()
+        for frame in {*common[:1], *common[-1:]}:
+            try:
+                for found, side in zip(ids, (pair.prediction, pair.truth), strict=True):
+                    found.update(np.unique(side.labels(frame)).tolist())
+            except CarlascError:
+                continue  # scoring names it
+    predicted, true = ids[0] - {IGNORED_ID}, ids[1]
+    beyond = true and max(true) > max(usual.names)
+    return usual if predicted and predicted <= usual.names.keys() and beyond else None
 
 
 def evaluate(
@@ -282,8 +374,9 @@ def evaluate(
     convention: str | Convention | None = None,
     grid: str | None = None,
     truth_grid: str | None = None,
-    source_classes: str | None = None,
+    source_classes: AnyPath | ClassTable | None = None,
     scoring: Scoring = Scoring(),  # noqa: B008 (frozen)
+    sequences: Collection[str] = (),
     frames: Frames = None,
     name: str | None = None,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
@@ -292,8 +385,8 @@ def evaluate(
 
     Args:
         source: the predictions: anything that `carlasc.open` opens, the folder of one grid, a
-            folder of `.label` files, or files of SemanticKITTI, SSCBench, Occ3D, OpenOccupancy or
-            CarlaOcc.
+            folder of `.label` files, or files of SemanticKITTI, SSCBench, Occ3D, OpenOccupancy,
+            SurroundOcc, OccNet or CarlaOcc.
         truth: the ground truth, in the same forms.
         convention: the rules of a benchmark: a Convention or a name in
             `carlasc.metrics.CONVENTIONS`. It defines the scored voxels, the classes, and the mean.
@@ -304,8 +397,9 @@ def evaluate(
             grid of a sequence.
         truth_grid: name of the grid with the ground truth. None: evaluation, or the only grid of a
             sequence.
-        source_classes: class table of the predictions, for data whose metadata name none. None: the
-            default table of the convention.
+        source_classes: class table of the predictions, for data whose metadata name none: a table,
+            its name, or a JSON or YAML file. None: the default table of the convention.
+        sequences: paths or names of the sequences to score; empty scores all.
         scoring: voxels to score, and additional scores.
         frames: frames to score; None scores all frames of the ground truth.
         name: name of the predictions in the tables. None: the name of the source.
@@ -319,7 +413,8 @@ def evaluate(
         MissingDataError: no grid exists, a sequence has no ground truth, or no frame can be scored.
         FormatError: the grids or classes of prediction and ground truth cannot be compared.
     """
-    pairs, notes = pair_grids(source, truth, grid, truth_grid)
+    check_types(evaluate, locals())
+    pairs, notes = pair_grids(source, truth, grid, truth_grid, sequences)
     return score_pairs(
         pairs, convention, source_classes, scoring, frames, name or _name_of(source), run, notes
     )
@@ -328,7 +423,7 @@ def evaluate(
 def score_pairs(
     pairs: list[Pair],
     convention: str | Convention | None,
-    source_classes: str | None,
+    source_classes: AnyPath | ClassTable | None,
     scoring: Scoring,
     frames: Frames,
     name: str,
@@ -340,6 +435,13 @@ def score_pairs(
     Raises:
         CarlascError: no frame can be scored.
     """
+    kinds = _by_coordinates(pairs)
+    if len(kinds) > 1:
+        first, *others = (
+            score_pairs(part, convention, source_classes, scoring, frames, name, run, notes)
+            for part in kinds.values()
+        )
+        return replace(first, apart=dict(zip([*kinds][1:], others, strict=True)))
     scorer = Scorer(convention, pairs, source_classes, scoring)
     _score_frames([scorer], pairs, frames, run)
     result = scorer.result(name, notes)
@@ -354,7 +456,8 @@ def evaluate_by_all_conventions(
     *,
     grid: str | None = None,
     truth_grid: str | None = None,
-    source_classes: str | None = None,
+    source_classes: AnyPath | ClassTable | None = None,
+    sequences: Collection[str] = (),
     frames: Frames = None,
     name: str | None = None,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
@@ -367,7 +470,8 @@ def evaluate_by_all_conventions(
         truth: the ground truth, in the same forms.
         grid: name of the predicted grid.
         truth_grid: name of the true grid.
-        source_classes: name of the class table of the predictions.
+        source_classes: class table of the predictions, as in `evaluate`.
+        sequences: paths or names of the sequences to score; empty scores all.
         frames: frames to score.
         name: name of the predictions in tables.
         run: how the work is distributed, and the progress callback.
@@ -375,7 +479,11 @@ def evaluate_by_all_conventions(
     Returns:
         By name of the convention: the scores, or the error that prevented them.
     """
-    pairs, notes = pair_grids(source, truth, grid, truth_grid)
+    pairs, notes = pair_grids(source, truth, grid, truth_grid, sequences)
+    first, *others = _by_coordinates(pairs).items()
+    pairs = first[1]
+    for kind, _ in others:
+        notes = (*notes, f"{kind} grids are not in these scores, which are of {first[0]} grids")
     scorers = {
         convention: Scorer(convention, pairs, source_classes, Scoring())
         for convention in CONVENTIONS
@@ -385,6 +493,14 @@ def evaluate_by_all_conventions(
         convention: scorer.result(name or _name_of(source), notes)
         for convention, scorer in scorers.items()
     }
+
+
+def _by_coordinates(pairs: list[Pair]) -> dict[str, list[Pair]]:
+    """Return the pairs by the coordinates of their grids, Cartesian ones first."""
+    kinds: dict[str, list[Pair]] = {}
+    for pair in sorted(pairs, key=lambda pair: pair.coordinates):
+        kinds.setdefault(pair.coordinates, []).append(pair)
+    return kinds
 
 
 def _name_of(source: Place) -> str:

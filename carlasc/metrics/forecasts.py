@@ -9,19 +9,22 @@ import numpy as np
 
 from carlasc.core.arrays import BoolArray, IntArray, LabelArray
 from carlasc.core.choices import Around
+from carlasc.core.classes import ClassTable
 from carlasc.core.frames import Frames
 from carlasc.core.geometry import invert
 from carlasc.core.grids import Grid
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics.conventions import Convention
 from carlasc.metrics.evaluation import score_pairs
-from carlasc.metrics.grids import GridFrames, SeenBy, SequenceGrid
+from carlasc.metrics.grids import SequenceGrid
 from carlasc.metrics.pairs import Pair, Place, pair_grids
 from carlasc.metrics.results import Evaluation
 from carlasc.metrics.scoring import Scoring
 from carlasc.metrics.temporal import moved_grid
 from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
+from carlasc.storage.files import AnyPath
+from carlasc.storage.voxel_files import GridFrames, SeenBy
 
 _NAMED = re.compile(r"(.+)_(\d+(?:\.\d+)?)s")  # name of a forecast grid: a name and a time horizon
 # fact: forecast-time
@@ -52,7 +55,7 @@ class FutureGrid(GridFrames):
             )
         self.grid, self.around = grid, around
         self.path, self.location = grid.path, grid.location
-        self.spec, self.classes = grid.spec, grid.classes
+        self.spec, self.classes, self.named = grid.spec, grid.classes, grid.named
         numbers, sequence = grid.frames(), grid.sequence
         times = sequence.times_of(numbers)
         wanted = times + horizon_s
@@ -106,7 +109,7 @@ def evaluate_forecasts(
     convention: str | Convention | None = None,
     grid: str | None = None,
     truth_grid: str | None = None,
-    source_classes: str | None = None,
+    source_classes: AnyPath | ClassTable | None = None,
     scoring: Scoring = Scoring(),  # noqa: B008 (frozen)
     frames: Frames = None,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)

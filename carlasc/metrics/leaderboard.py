@@ -8,11 +8,12 @@ import html
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from carlasc.core.notebook import data_frame
-from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_types
 from carlasc.metrics.results import Cell, FigureTable
 from carlasc.storage.files import AnyPath, parse_json
 
@@ -66,12 +67,11 @@ class ScoreTable:
 
     def to_markdown(self) -> str:
         """Return a Markdown table."""
-        table = self.table()
-        lines = [table.header, ["---"] + ["---:"] * (len(table.header) - 1), *table.texts()]
-        rows = (
-            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
-        )
-        return f"{table.title}\n\n" + "\n".join(rows) + "\n"
+        return self.table().to_markdown()
+
+    def to_csv(self) -> str:
+        """Return a CSV table."""
+        return self.table().to_csv()
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return one row per result, with the columns of `table`.
@@ -123,11 +123,11 @@ class ScoreTable:
         return f'<svg {size} role="img" aria-label="IoU of each class">{bars}</svg>'
 
 
-def scores(files: Iterable[AnyPath], *, mixed: bool = False) -> ScoreTable:
+def scores(files: AnyPath | Iterable[AnyPath], *, mixed: bool = False) -> ScoreTable:
     """Read the results of several evaluations (`carlasc evaluate --json`) into one table.
 
     Args:
-        files: JSON files.
+        files: JSON files, or one.
         mixed: allow results by different conventions, which cannot be compared, and show the
             convention of each.
 
@@ -137,6 +137,8 @@ def scores(files: Iterable[AnyPath], *, mixed: bool = False) -> ScoreTable:
         FormatError: a file is not a result of an evaluation.
         MissingDataError: a file does not exist, or none was given.
     """
+    check_types(scores, locals())
+    files = [files] if isinstance(files, str | PathLike) else files
     results = tuple(_read(Path(file)) for file in files)
     if not results:
         raise MissingDataError(

@@ -31,7 +31,12 @@ _MARGIN_M = 1.0
 _FEWEST_RAYS = 10  # segments with fewer rays are not counted as false negatives or false positives
 
 
-def ray_origins(world_T_sensors: FloatArray, frame: int, spec: GridSpec) -> FloatArray:
+def ray_origins(
+    world_T_sensors: FloatArray,
+    frame: int,
+    spec: GridSpec,
+    sensor: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> FloatArray:
     """Return the ray origins of a frame: sensor positions along the trajectory that are inside the
     grid of the frame.
 
@@ -39,13 +44,15 @@ def ray_origins(world_T_sensors: FloatArray, frame: int, spec: GridSpec) -> Floa
         world_T_sensors: (F, 4, 4) poses of the (key) frames of the sequence.
         frame: row of the scored frame in `world_T_sensors`.
         spec: the grid of the frame.
+        sensor: position of the sensor in the frame of the poses, such as that of a LiDAR on a
+            vehicle, metres.
 
     Returns:
-        (O, 3) metres, in the sensor frame of the scored frame. At most 8 positions, evenly selected
+        (O, 3) metres, in the frame of the scored frame. At most 8 positions, evenly selected
         from those that are at least 1 m from the sides of the grid in x and y.
     """
     here: Transform = invert(world_T_sensors[frame])
-    places = (here @ world_T_sensors)[:, :3, 3]
+    places = ((here @ world_T_sensors) @ [*sensor, 1.0])[:, :3]
     inside = (places[:, :2] > np.array(spec.lower[:2]) + _MARGIN_M) & (
         places[:, :2] < np.array(spec.upper[:2]) - _MARGIN_M
     )

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from carlasc.core.arrays import IntArray
-from carlasc.core.classes import ClassTable
+from carlasc.core.classes import ClassTable, TableUse
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics.actor_scores import ActorScore
 from carlasc.metrics.confusion import ConfusionMatrix, json_number
@@ -53,6 +53,14 @@ class FigureTable:
     def to_csv(self) -> str:
         """Return the table as CSV with a header."""
         return _csv([self.header, *self.texts()])
+
+    def to_markdown(self) -> str:
+        """Return the table as Markdown, with the title above."""
+        lines = [self.header, ["---"] + ["---:"] * (len(self.header) - 1), *self.texts()]
+        rows = (
+            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
+        )
+        return f"{self.title}\n\n" + "\n".join(rows) + "\n"
 
     def to_latex(self) -> str:
         r"""Return the table as a LaTeX `tabular` with the lines of the package booktabs (\toprule,
@@ -114,6 +122,11 @@ class Evaluation:
         breakdown: the confusion matrix of each requested region, by name.
         rays: RayIoU, if requested; otherwise None.
         actors: scores of actors and velocities, if requested; otherwise None.
+        source_classes: class tables by which the predictions were read.
+        truth_classes: class tables by which the ground truth was read.
+        unknown_ids: number of voxels by id that is no class, for "prediction" and "truth", if such
+            ids were allowed.
+        apart: scores of the grids with other coordinates, by their name; `matrix` has none of them.
     """
 
     name: str
@@ -128,6 +141,10 @@ class Evaluation:
     breakdown: Mapping[str, ConfusionMatrix] = field(default_factory=dict)
     rays: RayScore | None = None
     actors: ActorScore | None = None
+    source_classes: tuple[TableUse, ...] = ()
+    truth_classes: tuple[TableUse, ...] = ()
+    unknown_ids: Mapping[str, Mapping[int, int]] = field(default_factory=dict)
+    apart: Mapping[str, Evaluation] = field(default_factory=dict)
 
     @property
     def classes(self) -> ClassTable:
@@ -152,6 +169,30 @@ class Evaluation:
         return self.score.miou
 
     @property
+    def absent_classes(self) -> list[str]:
+        """The classes of the mean that occur neither in the predictions nor in the ground truth."""
+        return [name for name, value in self.class_iou.items() if math.isnan(value)]
+
+    @property
+    def miou_of_present(self) -> float:
+        """Mean IoU over the classes of the convention that occur; NaN for none."""
+        values = [value for value in self.class_iou.values() if not math.isnan(value)]
+        return sum(values) / len(values) if values else math.nan
+
+    def about_absent(self) -> str:
+        """Return what the absent classes do to the mean, one sentence; "" without such classes."""
+        names, rule = self.absent_classes, self.convention.absent
+        if not names or not self.matrix.total:
+            return ""
+        effect = {"zero": "count 0 in the mean", "nan": "make the mean undefined"}
+        what = effect.get(rule, "are left out of the mean")
+        others = f"; mean of the others {100 * self.miou_of_present:.2f}" if rule in effect else ""
+        plural = "classes" if len(names) > 1 else "class"
+        return (
+            f"{plural} in neither predictions nor ground truth {what}: {', '.join(names)}{others}"
+        )
+
+    @property
     def miou_without_free(self) -> float:
         """Mean IoU over the classes of the convention except free.
 
@@ -159,7 +200,7 @@ class Evaluation:
         """
         free = self.classes.names[self.convention.free]
         values = [0.0 if math.isnan(v) else v for name, v in self.class_iou.items() if name != free]
-        return sum(values) / len(values) if values else math.nan
+        return sum(values) / len(values) if values and self.matrix.total else math.nan
 
     def interval(self) -> Interval | None:
         """Return the confidence interval of `miou` by bootstrap over sequences; None for fewer than
@@ -233,12 +274,23 @@ class Evaluation:
     def to_dict(self) -> dict[str, Any]:
         """Return all scores by name, as fractions, for JSON; None for undefined scores."""
         interval = self.interval()
-        means = {"miou": self.miou, "miou_without_free": self.miou_without_free}
+        means = {
+            "miou": self.miou,
+            "miou_without_free": self.miou_without_free,
+            "miou_of_present": self.miou_of_present,
+        }
         figures = means | {"accuracy": self.matrix.accuracy} | _figures_of(self.score)
         return {
             "name": self.name,
             "convention": self.convention.name,
             "classes": self.classes.name,
+            "source_classes": [vars(use) for use in self.source_classes],
+            "truth_classes": [vars(use) for use in self.truth_classes],
+            "unknown_ids": {
+                side: {str(i): n for i, n in ids.items()} for side, ids in self.unknown_ids.items()
+            },
+            "absent_classes": self.absent_classes,
+            "absent": self.convention.absent,
             "frames": self.frames,
             "voxels": self.voxels,
             "scored_voxels": self.matrix.total,
@@ -257,6 +309,7 @@ class Evaluation:
             "confusion": self.matrix.counts.tolist(),
             "notes": list(self.notes),
             "failures": [list(failure) for failure in self.failures],
+            "apart": {name: other.to_dict() for name, other in self.apart.items()},
         }
 
 

@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 from carlasc.core.arrays import BoolArray
 from carlasc.core.choices import Voxels as Voxels  # noqa: PLC0414 (part of this module)
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError, check_choice
+from carlasc.errors import ArgumentError, check_choice, check_types
 
 Region = Callable[[GridSpec], BoolArray]
 BREAKDOWNS = ("distance", "height", "visibility", "motion", "seen")
@@ -31,6 +31,9 @@ class Scoring:
             grid.
         actors: also score actors: panoptic quality (PQ), tracking (LSTQ), and velocities.
             Prediction and ground truth need the field `instance`, for velocities also `velocity`.
+        allow_unknown: go on where an id is no class of its table, and count such voxels: they are
+            not scored in the ground truth, and count as free in predictions. Otherwise the frame is
+            not scored.
 
     Raises:
         ArgumentError: a value is not valid.
@@ -41,8 +44,10 @@ class Scoring:
     by: Collection[str] = ()
     rays: bool = False
     actors: bool = False
+    allow_unknown: bool = False
 
     def __post_init__(self) -> None:
+        check_types(Scoring, vars(self))
         check_choice("voxels", self.voxels, Voxels)
         for name in self.by:
             check_choice("by", name, BREAKDOWNS)

@@ -85,9 +85,20 @@ def ground_height(points: AnyFloatArray) -> float:
     Returns:
         Metres; NaN if no plane is found.
     """
-    own = np.ascontiguousarray(points[finite(points[:, :3]), :3], np.float32)
-    plane = _plane(own, _lowest(own)[2])
+    plane = ground_plane(points)
     return float("nan") if plane is None else float(plane[2])
+
+
+def ground_plane(points: AnyFloatArray, steepest: float = _STEEPEST) -> FloatArray | None:
+    """Return (slope along x, slope along y, z below the sensor) of the ground around a sensor, as
+    `ground_height` finds it; None without one.
+
+    Args:
+        points: (N, 3 or more) float, metres, in the frame of a sensor: x, y, z first.
+        steepest: greatest slope, metres per metre.
+    """
+    own = np.ascontiguousarray(points[finite(points[:, :3]), :3], np.float32)
+    return _plane(own, _lowest(own)[2], steepest)
 
 
 @cached
@@ -115,7 +126,9 @@ def _lowest(
     return sector, ring, lowest
 
 
-def _plane(points: Float32Array, lowest: IntArray) -> FloatArray | None:
+def _plane(
+    points: Float32Array, lowest: IntArray, steepest: float = _STEEPEST
+) -> FloatArray | None:
     """Return (slope along x, slope along y, z at the sensor) of the plane through most of the
     lowest points nearby; None without one.
     """
@@ -135,7 +148,7 @@ def _plane(points: Float32Array, lowest: IntArray) -> FloatArray | None:
     planes = np.column_stack(
         [along_x, along_y, corner[:, 2] - along_x * corner[:, 0] - along_y * corner[:, 1]]
     )
-    planes = planes[np.hypot(planes[:, 0], planes[:, 1]) < _STEEPEST]
+    planes = planes[np.hypot(planes[:, 0], planes[:, 1]) < steepest]
     if not len(planes):
         return None
     weight = 1.0 / np.maximum(np.hypot(chosen[:, 0], chosen[:, 1]) / _NEAR_M, 1.0)

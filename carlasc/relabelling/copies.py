@@ -13,12 +13,12 @@ from typing import Any, Self, TypeVar
 from carlasc.core.arrays import IntArray
 from carlasc.core.classes import ClassTable
 from carlasc.errors import ArgumentError
-from carlasc.groundtruth.reporting import digest_of_bytes
 from carlasc.running.processes import one_pool
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.derived_copies import CopyResult, DerivedCopy, DerivedSequence
 from carlasc.storage.files import AnyPath
+from carlasc.storage.inputs import digest_of_bytes
 from carlasc.storage.layout import PREDICTED
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 

@@ -31,7 +31,7 @@ from carlasc.core.arrays import (
 from carlasc.core.cameras import CameraModel
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError, MissingDataError, check_types
 from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
 from carlasc.groundtruth.options import FromScans, Voting
@@ -46,7 +46,7 @@ from carlasc.relabelling.copies import (
     write_in_stages,
 )
 from carlasc.relabelling.from_motion import points_of_actors, scan_sequences_of
-from carlasc.relabelling.predictions import PredictionReader, read_table
+from carlasc.relabelling.predictions import PredictionReader
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
 from carlasc.storage.arrays import NUMBERS, ArrayFormat, read_npy
@@ -57,6 +57,7 @@ from carlasc.storage.camera_files import (
     read_image,
     scan_T_camera,
 )
+from carlasc.storage.class_files import read_classes
 from carlasc.storage.derived_copies import sequences_with_scans
 from carlasc.storage.files import AnyPath
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
@@ -132,10 +133,11 @@ def label_images(
             are not valid.
         StorageError: the files cannot be written.
     """
+    check_types(label_images, locals())
     began = time.perf_counter()
     root = None if pixels is None else Path(pixels)
     by = by if by is not None else "images" if root is None else root.resolve().name
-    table = None if classes is None else read_table(classes)
+    table = None if classes is None else read_classes(classes)[0]
     source = as_source(source)
     given = sequences_with_scans(source)
     shown = {path: PixelClasses.find(one, root) for path, one in given.items()}

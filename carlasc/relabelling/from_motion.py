@@ -12,7 +12,7 @@ from carlasc.core.arrays import AnyArray, BoolArray, Float32Array, FloatArray, U
 from carlasc.core.frames import FrameRange
 from carlasc.core.geometry import invert, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, check_types
 from carlasc.groundtruth.from_scans.actor_voxels import velocity_at
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
@@ -87,6 +87,7 @@ def label_motion(
         FormatError: poses or times are not valid.
         StorageError: the files cannot be written.
     """
+    check_types(label_motion, locals())
     began = time.perf_counter()
     if observe.dynamic != "align" or observe.motion.source == "none":
         found = f'dynamic="{observe.dynamic}", motion "{observe.motion.source}"'

@@ -25,8 +25,8 @@ from carlasc.core.arrays import (
 )
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
-from carlasc.core.tables import TABLES, remaps_between, table_from_json, to_table
-from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.core.tables import remaps_between, to_table
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_types
 from carlasc.relabelling.copies import (
     PREDICTED_FIELDS,
     LabelResult,
@@ -37,8 +37,9 @@ from carlasc.relabelling.copies import (
 from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.arrays import NUMBERS, WHOLE_NUMBERS, ArrayFormat, open_npz, read_npy
+from carlasc.storage.class_files import read_classes
 from carlasc.storage.derived_copies import sequences_with_scans
-from carlasc.storage.files import AnyPath, parse_json
+from carlasc.storage.files import AnyPath
 from carlasc.storage.protocol import Sequence, Source
 
 SUFFIXES = (".label", ".npy", ".npz")
@@ -98,10 +99,11 @@ def label(
         FormatError: a file of predictions does not fit its scan or its class table.
         StorageError: the files cannot be written.
     """
+    check_types(label, locals())
     began = time.perf_counter()
     source, root = as_source(source), Path(predictions)
     by = root.resolve().name if by is None else by
-    table = None if classes is None else read_table(classes)
+    table = None if classes is None else read_classes(classes)[0]
     chosen, scans = FrameRange.of(frames), sequences_with_scans(source)
     files = find_predictions(root, scans, chosen)
     sequences = {
@@ -197,28 +199,6 @@ def find_predictions(
             root, expected="a file for each frame", found="; ".join(lacking), advice=advice
         )
     return result
-
-
-def read_table(classes: AnyPath | ClassTable) -> ClassTable:
-    """Return a class table, given as a table, its name, or a JSON file: a class table in the form
-    of carlasc.json, or a carlasc.json.
-
-    Raises:
-        ArgumentError: `classes` is neither a known name nor a file.
-        FormatError: the file holds no class table.
-    """
-    if isinstance(classes, ClassTable):
-        return classes
-    if str(classes) in TABLES:
-        return TABLES[str(classes)]
-    if not (path := Path(classes)).is_file():
-        raise ArgumentError(
-            "classes",
-            expected=f"one of {', '.join(TABLES)}, or a JSON file",
-            found=repr(str(classes)),
-        )
-    values = parse_json(path.read_bytes(), str(path))
-    return table_from_json(values.get("classes", values), str(path))
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 
 from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.geometry import invert, multiply
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, check_types
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.motion_pass import (
     pose_notes,
@@ -24,7 +24,6 @@ from carlasc.groundtruth.from_scans.sequences import (
     with_estimated_poses,
 )
 from carlasc.groundtruth.options import FromScans
-from carlasc.groundtruth.reporting import digest_of_bytes
 from carlasc.motion.mounting import Mounting, find_mounting
 from carlasc.motion.options import PoseOptions
 from carlasc.motion.refinement import RefinedPoses
@@ -38,6 +37,7 @@ from carlasc.storage.derived_copies import (
     sequences_with_scans,
 )
 from carlasc.storage.files import AnyPath
+from carlasc.storage.inputs import digest_of_bytes
 from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 
@@ -101,6 +101,7 @@ def refine(
         DependencyError: poses have to be estimated, and kiss-icp is not installed.
         StorageError: the files cannot be written.
     """
+    check_types(refine, locals())
     began = time.perf_counter()
     if poses.refine == "never":
         raise ArgumentError("refine", expected="auto or always", found="'never'")

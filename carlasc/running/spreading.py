@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol, Self, TypeVar
 
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, check_types
 
 
 class DaskClient(Protocol):
@@ -147,6 +147,7 @@ class Run:
     progress: Callable[[int, int], None] | None = None
 
     def __post_init__(self) -> None:
+        check_types(Run, vars(self))
         if self.workers is not None and self.workers < 1:
             raise ArgumentError("workers", expected="at least 1", found=str(self.workers))
 

@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from carlasc.core.arrays import AnyArray
-from carlasc.errors import ConflictError
+from carlasc.errors import ConflictError, check_types
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
@@ -221,6 +221,7 @@ def unpack(
         FormatError, MissingDataError: a part of the source is damaged or missing.
         StorageError: the files cannot be written: a full disk, a folder without write permission.
     """
+    check_types(unpack, locals())
     began = time.perf_counter()
     source = as_source(source)
     refuse_overlap(out, source)

@@ -35,6 +35,7 @@ from carlasc.storage.files import (
     write_atomic,
 )
 from carlasc.storage.folder import FolderSequence, FolderSink, FolderSource
+from carlasc.storage.inputs import sequence_states
 from carlasc.storage.layout import Metadata
 from carlasc.storage.packed.output import remove
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
@@ -199,7 +200,8 @@ class DerivedCopy:
         self.mark: Path | None = None
         if not is_url(out) and run.part.count == 1:
             _clear(Path(out), kind, is_kind, overwrite=overwrite)
-            settings = {"source": source.location, "kind": kind, **made_from}
+            inputs = sequence_states(source)
+            settings = {"source": source.location, "kind": kind, "inputs": inputs, **made_from}
             self.mark = _mark(unfinished(Path(out)), settings, overwrite=overwrite)
 
     def writer(self, path: str) -> SequenceWriter | None:

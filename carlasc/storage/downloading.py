@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from carlasc.errors import ArgumentError, ConflictError, FormatError, check_choice
+from carlasc.errors import ArgumentError, ConflictError, FormatError, check_choice, check_types
 from carlasc.running.spreading import StepCounter
 from carlasc.storage.extraction import check_space, extract_zip, extracted_size
 from carlasc.storage.files import (
@@ -183,6 +183,7 @@ def download(
         CarlascError: the server cannot be reached. The next call continues with the bytes fetched
             so far.
     """
+    check_types(download, locals())
     began = time.perf_counter()
     if connections < 1:
         raise ArgumentError("connections", expected="1 or more", found=str(connections))

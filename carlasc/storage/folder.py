@@ -6,7 +6,7 @@ The writer supports object stores too.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from carlasc.storage.protocol import FrameArrays, Sequence, SequenceWriter, Sink
 from carlasc.storage.published import PublishedSequence, PublishedSource
 from carlasc.storage.transport.remote_tree import target_of
 from carlasc.storage.transport.trees import LocalTarget, LocalTree, Target
+from carlasc.storage.voxel_files import find_voxels
 
 # end record of a zip without a comment, as NumPy writes it
 _ZIP_END, _ZIP_END_BYTES = (
@@ -49,10 +50,23 @@ class FolderSource(PublishedSource):
     def sequences(self) -> Mapping[str, Sequence]:
         """Return the sequences found up to four levels down, by path.
 
+        A folder without any may hold voxel grids of another program, which are then presented in
+        the layout.
+
         Raises:
             MissingDataError: no sequence was found; the message says what was expected.
         """
-        return {path: FolderSequence(self.folder, path) for path in super().sequences()}
+        sequences: dict[str, Sequence] = {}
+        try:
+            sequences = {path: FolderSequence(self.folder, path) for path in super().sequences()}
+        except MissingDataError:
+            if (found := find_voxels(self.folder)) is None:
+                raise
+            return found.sequences()
+        # folders of other programs may have names of the layout, such as predictions/
+        is_other = not any(sequence.fields() for sequence in sequences.values())
+        voxels = find_voxels(self.folder) if is_other else None
+        return sequences if voxels is None else voxels.sequences()
 
 
 class FolderSequence(PublishedSequence):
@@ -216,6 +230,11 @@ class FolderWriter(SequenceWriter):
         self.target.remove_many(f"{grid}/{name}" for name in names)
         self.target.remove(layout.params_file(grid))
         self._cells.pop(grid, None)
+
+    def remove_frames(self, fields: Iterable[str], frames: Collection[int]) -> None:
+        """Remove files of some frames."""
+        entries = [layout.field_named(field) for field in fields]
+        self.target.remove_many(entry.file(frame) for entry in entries for frame in frames)
 
     def write_document(self, name: str, data: bytes) -> None:
         """Write a text file."""

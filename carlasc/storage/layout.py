@@ -208,6 +208,11 @@ def derived(name: str, digest: str) -> str:
     return f"{DERIVED}/{name}-{digest[:16]}.npz"
 
 
+def record_file(name: str) -> str:
+    """Return the path of a table of `carlasc.storage.inputs` under `<coordinates>/`."""
+    return f"{DERIVED}/{name}.json"
+
+
 def report_file(grid: str) -> str:
     """Return the path of a grid's carlasc-report.json under `<coordinates>/`."""
     return f"{grid}/{REPORT}"

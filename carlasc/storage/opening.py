@@ -6,7 +6,7 @@ import os
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_types
 from carlasc.running.spreading import Part
 from carlasc.storage.files import AnyPath, damaged, unfinished
 from carlasc.storage.folder import FolderSink, FolderSource
@@ -19,9 +19,11 @@ from carlasc.storage.transport.clients import HUB
 from carlasc.storage.transport.remote_tree import RemoteTree, target_of
 from carlasc.storage.transport.trees import LocalTree, Target, Tree, is_url
 from carlasc.storage.transport.zipped import ZipTree
+from carlasc.storage.voxel_files import find_voxels
 
 PACKED = (".zarr", ".h5", ".hdf5", ".parquet")
 """Suffixes of packed stores."""
+VOXEL_SUFFIXES = (".npz", ".npy", ".label")  # of files that may be voxel grids of other programs
 
 if TYPE_CHECKING:
     from carlasc.storage.zarr.zarr_sink import ZarrSink
@@ -58,6 +60,7 @@ def open(
         DependencyError: a package is missing; the message names the extra of carlasc that installs
             it.
     """
+    check_types(open, locals())
     text = os.fspath(path)
     if is_url(text):
         return _open_remote(RemoteTree(text, storage_options), cache)
@@ -66,6 +69,8 @@ def open(
         raise unfinished_error(local)
     if local.is_dir():
         return _open_store(LocalTree(local)) or FolderSource(local)
+    if local.suffix in VOXEL_SUFFIXES and (found := find_voxels(local)) is not None:
+        return found
     if local.is_file():
         return _open_file(LocalTree(local.parent), local.name)
     raise MissingDataError(

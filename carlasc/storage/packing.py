@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from carlasc.core.arrays import AnyArray
-from carlasc.errors import ArgumentError, ConflictError
+from carlasc.errors import ArgumentError, ConflictError, check_types
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.copying import (
@@ -115,6 +115,7 @@ def pack(
         FormatError, MissingDataError: a file of the source is damaged or missing.
         StorageError: the store cannot be written: a full disk, a folder without write permission.
     """
+    check_types(pack, locals())
     began = time.perf_counter()
     options = PackOptions(small, lossy_mm)
     run.part.refuse(overwrite)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import math
 from abc import ABC, abstractmethod
-from collections.abc import ItemsView, Iterable, Iterator, Mapping, ValuesView
+from collections.abc import Collection, ItemsView, Iterable, Iterator, Mapping, ValuesView
 from contextlib import suppress
 from functools import cached_property
 from typing import Any, Protocol, Self, cast
@@ -20,7 +20,7 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, IntArray, LabelArray
 from carlasc.core.boxes import Boxes
-from carlasc.core.classes import ClassTable
+from carlasc.core.classes import ClassTable, TableUse
 from carlasc.core.frames import check_seconds
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import Coordinates, Grid, GridSpec
@@ -73,6 +73,8 @@ class Sequence(ABC):
         name: "Town01_Light".
         coordinates: "cartesian" or "cylindrical".
         tree: the tree of files that it is read from; None if it is not read from files.
+        awaited: frames whose scans could not be written yet. Grids to which they belong wait for
+            them.
     """
 
     path: str
@@ -81,6 +83,7 @@ class Sequence(ABC):
     name: str
     coordinates: Coordinates
     tree: FileTree | None = None
+    awaited: frozenset[int] = frozenset()
     _given_poses: FloatArray | None = None
 
     @abstractmethod
@@ -205,6 +208,18 @@ class Sequence(ABC):
         if table is None:
             return self.metadata.classes
         return table_from_json(table, f"{self.location}/{layout.params_file(grid)}")
+
+    def table_use(self, grid: str = "") -> TableUse:
+        """Return the class table of the points or of a grid, and whether carlasc.json or the
+        params.json of the grid names it; otherwise that of CARLA is assumed, as published files
+        have it.
+        """
+        name, table = layout.METADATA, self.classes_of(grid) if grid else self.metadata.classes
+        named = bool(grid) and self._record(grid).get("classes") is not None
+        if not named and name in self.documents():
+            values = parse_json(self.read_document(name), f"{self.location}/{name}")
+            named = "classes" in values
+        return TableUse(table.name, "file" if named else "assumed")
 
     def predicted_by(self, grid: str) -> str | None:
         """Return the name of the network that predicted a grid, from its params.json; None if the
@@ -603,6 +618,19 @@ class SequenceWriter(ABC):
         """
         raise ConflictError(
             f"{self.location}: this store cannot replace its grid {grid}: write to a new store"
+        )
+
+    def remove_frames(self, fields: Iterable[str], frames: Collection[int]) -> None:
+        """Remove fields of some frames, if they exist.
+
+        Raises:
+            ConflictError: the store cannot remove frames.
+        """
+        raise ConflictError(
+            self.location,
+            expected="the frames of its input only",
+            found=f"the frames {first_names(map(str, sorted(frames)))}, which the input lacks now",
+            advice="this store cannot remove frames: write to a new store",
         )
 
     def close(self) -> None:  # noqa: B027 (most stores have nothing to finish)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from hashlib import sha256
 from typing import Any, TypeVar
 
@@ -35,7 +34,6 @@ _LINES = {
     layout.POSES: (layout.encode_poses, layout.decode_poses),
     layout.TIMES: (layout.encode_times, layout.decode_times),
 }
-_LOOKED_AT = 16  # number of scans that are read to identify a sequence
 _OTHER_SETTINGS = "choose another `name`, or replace the grid with `overwrite=True`"
 _PUBLISHED = "this is published data, which is never written to: choose another `name` or `out`"
 
@@ -236,30 +234,6 @@ def _other_data(where: str, frame: int) -> ConflictError:
     )
 
 
-def scans_digest(sequence: Sequence, frames: IntArray) -> str:
-    """Return a digest of 16 scans of a sequence.
-
-    Changes of other scans are not detected, but long drives need not be read.
-    """
-    digest = sha256()
-    for row in np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).astype(int)).tolist():
-        for name in sorted(sequence.fields() & layout.SCAN_FIELDS.keys()):
-            if frames[row] in sequence.frames(name):
-                digest.update(_bytes_of(sequence, name, int(frames[row])))
-    return digest.hexdigest()
-
-
-def _bytes_of(sequence: Sequence, name: str, frame: int) -> bytes:
-    """Return the bytes of a field; empty if it cannot be read.
-
-    The error is reported when the grid is made.
-    """
-    for _ in range(2):  # a second try, because a temporary error must not change the digest
-        with suppress(CarlascError):
-            return np.ascontiguousarray(sequence.read(name, frame)).tobytes()
-    return b""
-
-
 def derived_key(sequence: Sequence, frames: IntArray, scans: str, **settings: Any) -> str:
     """Return a digest of settings, poses, times and scans.
 
@@ -268,7 +242,7 @@ def derived_key(sequence: Sequence, frames: IntArray, scans: str, **settings: An
     Args:
         sequence: the sequence.
         frames: numbers of its frames with scans.
-        scans: result of `scans_digest`.
+        scans: digest of the content of all of these scans (see `carlasc.storage.inputs`).
         **settings: everything else that the result depends on.
     """
     about = {

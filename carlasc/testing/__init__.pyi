@@ -9,3 +9,5 @@ from .drives import KINDS as KINDS
 from .drives import DriveScan as DriveScan
 from .drives import SimulatedDrive as SimulatedDrive
 from .drives import Thing as Thing
+from .scenes import SCENES as SCENES
+from .scenes import write_scans as write_scans

@@ -5,6 +5,7 @@ Tests of converters write it in the format of another data set and compare.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -41,14 +42,15 @@ class Thing:
     heading: float = 0.0
     speed: float = 0.0
 
+    def place(self, seconds: FloatArray | float) -> FloatArray:
+        """Return the (..., 3) position of the center at some times."""
+        ahead = self.speed * np.array([np.cos(self.heading), np.sin(self.heading), 0.0])
+        return np.array(self.center) + np.asarray(seconds)[..., None] * ahead
+
     def world_T_box(self, seconds: FloatArray | float) -> FloatArray:
         """Return the (..., 4, 4) pose of the box at some times."""
         poses = np.broadcast_to(rotation_z(self.heading), (*np.shape(seconds), 4, 4)).copy()
-        way = np.asarray(seconds)[..., None] * (
-            self.speed * np.array([np.cos(self.heading), np.sin(self.heading)])
-        )
-        poses[..., :2, 3] = np.array(self.center[:2]) + way
-        poses[..., 2, 3] = self.center[2]
+        poses[..., :3, 3] = self.place(seconds)
         return poses
 
 
@@ -118,6 +120,11 @@ class SimulatedDrive:
         things: the things in the street.
         channels: number of laser beams.
         columns: number of azimuths.
+        elevation_deg: the lowest and the highest beam.
+        range_m: farther hits give no point.
+        noise_m: standard deviation of the measured distances.
+        body: parts of the vehicle that its sensors see, in its frame.
+        way: returns the (..., 4, 4) poses of the vehicle at (...) seconds; None is the street.
     """
 
     frames: int = 8
@@ -136,6 +143,11 @@ class SimulatedDrive:
     things: tuple[Thing, ...] = field(default_factory=_street)
     channels: int = 20
     columns: int = 180
+    elevation_deg: tuple[float, float] = (-24.0, 8.0)
+    range_m: float = 60.0
+    noise_m: float = 0.0
+    body: tuple[Thing, ...] = ()
+    way: Callable[[FloatArray], FloatArray] | None = None
 
     _kept: dict[tuple[int, int], DriveScan] = field(
         default_factory=dict, init=False, repr=False, compare=False
@@ -149,9 +161,11 @@ class SimulatedDrive:
     def world_T_vehicle(self, seconds: FloatArray | float) -> FloatArray:
         """Return the (..., 4, 4) poses of the vehicle at some times.
 
-        It moves slightly from side to side.
+        On the street, it moves slightly from side to side.
         """
         at = np.asarray(seconds, np.float64)
+        if self.way is not None:
+            return self.way(at)
         x = self.speed * at
         poses = np.zeros((*at.shape, 4, 4))
         poses[..., 2, 2] = poses[..., 3, 3] = 1.0
@@ -201,7 +215,7 @@ class SimulatedDrive:
 
     def _look(self, frame: int, sensor: int) -> DriveScan:
         mount = self.sensors[sensor].vehicle_T_sensor
-        elevation = np.deg2rad(np.linspace(-24.0, 8.0, self.channels))
+        elevation = np.deg2rad(np.linspace(*self.elevation_deg, self.channels))
         azimuth = np.arange(self.columns) * (2 * np.pi / self.columns) - np.pi
         sweep = (np.arange(self.columns) / self.columns - 0.5) * self.period_s
         turn = (-sweep if self.clockwise else sweep) * self.rolling
@@ -218,9 +232,13 @@ class SimulatedDrive:
         at = frame * self.period_s + turn
         poses = self.world_T_vehicle(at) @ mount
         origins, directions = poses[:, :3, 3], np.einsum("nij,nj->ni", poses[:, :3, :3], rays)
-        reach, hit = self._nearest(origins, directions, at)
-        seen = reach < 60.0
+        own = np.broadcast_to(mount[:3, 3], origins.shape), rays @ mount[:3, :3].T
+        reach, hit = self._nearest((origins, directions), own, at)
+        seen = reach < self.range_m
         reach, hit, poses, turn = reach[seen], hit[seen], poses[seen], turn[seen]
+        if self.noise_m:
+            rng = np.random.default_rng([frame, sensor])
+            reach = reach + rng.normal(0.0, self.noise_m, len(reach))
         points = (rays[seen] * reach[:, None]).astype(np.float32)
         world = (
             np.einsum("nij,nj->ni", poses[:, :3, :3], points.astype(np.float64)) + poses[:, :3, 3]
@@ -230,10 +248,10 @@ class SimulatedDrive:
         ).astype(np.float32)
         remission = np.round(0.1 + 0.05 * hit % 0.8, 2).astype(np.float32)[:, None]
         kinds = np.array(
-            [KINDS.index("road"), *(KINDS.index(thing.kind) for thing in self.things)], np.uint8
+            [KINDS.index(kind) for kind in ("road", *(thing.kind for thing in self._all))], np.uint8
         )
         tracks = {thing: track for track, thing in enumerate(self._movable, 1)}
-        instances = np.array([0, *(tracks.get(thing, 0) for thing in self.things)], np.uint32)
+        instances = np.array([0, *(tracks.get(thing, 0) for thing in self._all)], np.uint32)
         return DriveScan(
             np.hstack([points, remission]),
             np.hstack([deskewed, remission]),
@@ -247,21 +265,28 @@ class SimulatedDrive:
     def _movable(self) -> tuple[Thing, ...]:
         return tuple(thing for thing in self.things if thing.kind in MOVABLE)
 
+    @property
+    def _all(self) -> tuple[Thing, ...]:
+        return self.things + self.body
+
     def _nearest(
-        self, origins: FloatArray, directions: FloatArray, at: FloatArray
+        self,
+        world: tuple[FloatArray, FloatArray],
+        own: tuple[FloatArray, FloatArray],
+        at: FloatArray,
     ) -> tuple[FloatArray, IntArray]:
         """Return the length of each ray, and what it hits: 0 for the ground, n for the n-th thing
-        from 1.
+        from 1. `world` and `own` are origins and directions in the frames of the world and of the
+        vehicle.
         """
+        origins, directions = world
         with np.errstate(divide="ignore", invalid="ignore"):
             reach = np.where(directions[:, 2] < 0, -origins[:, 2] / directions[:, 2], np.inf)
             hit = np.zeros(len(at), np.int64)
-            for number, thing in enumerate(self.things, 1):
-                box_T_world = invert(thing.world_T_box(at))
-                start = (
-                    np.einsum("nij,nj->ni", box_T_world[:, :3, :3], origins) + box_T_world[:, :3, 3]
-                )
-                ray = np.einsum("nij,nj->ni", box_T_world[:, :3, :3], directions)
+            for number, thing in enumerate(self._all, 1):
+                origins, directions = world if number <= len(self.things) else own
+                turn = rotation_z(thing.heading)[:3, :3]
+                start, ray = (origins - thing.place(at)) @ turn, directions @ turn
                 half = np.array(thing.size) / 2
                 one, other = (-half - start) / ray, (half - start) / ray
                 enter, leave = np.fmin(one, other).max(axis=1), np.fmax(one, other).min(axis=1)

@@ -17,18 +17,27 @@ import numpy as np
 from carlasc.core.arrays import AnyArray, FloatArray, IntArray, LabelArray, Uint32Array
 from carlasc.core.boxes import Boxes, mirror_boxes
 from carlasc.core.choices import Axes
-from carlasc.core.classes import ClassTable
+from carlasc.core.classes import ClassTable, TableUse
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.geometry import Transform, check_rigid, mirror_poses
 from carlasc.core.grids import Grid, GridSpec, mirror_spec, mirror_voxels
 from carlasc.core.scans import Scan, mirror_scan
-from carlasc.core.tables import TABLES, remaps_between, to_table
-from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_choice, first_names
+from carlasc.core.tables import remaps_between, to_table
+from carlasc.errors import (
+    ArgumentError,
+    FormatError,
+    MissingDataError,
+    check_choice,
+    check_types,
+    first_names,
+)
 from carlasc.metrics.grids import check_same_geometry, compare_grids
 from carlasc.storage import Sequence, Source, as_source, layout
+from carlasc.storage.class_files import read_classes
 from carlasc.storage.field_files import check_velocity
 from carlasc.storage.files import AnyPath
 from carlasc.storage.folder import FolderSequence
+from carlasc.storage.voxel_files import VoxelSequence, find_voxels
 from carlasc.viewing.colors import ACTORS, ERRORS, PALETTES, ClassColors, PaletteName, actor_ids
 from carlasc.viewing.photos import Photo, photos_of
 
@@ -58,7 +67,7 @@ class Scene:
         classes: class table to show, such as "carlasc11" (the paper's eleven). None: that of the
             data, or that of the ground truth if only its classes are common to both.
         source_classes: class table of the labels in the source, if its metadata do not name it:
-            carla, carlasc11, and so on.
+            carla, carlasc11, and so on, or a JSON or YAML file.
         palette: "class": the colours of the class table. "colorblind": colours for colour-blind
             readers. "height": colours by height, only for pictures.
 
@@ -75,18 +84,18 @@ class Scene:
     grid: str | None = None
     truth: SceneSource | None = None
     truth_grid: str | None = None
-    classes: ClassTable | str | None = None
-    source_classes: ClassTable | str | None = None
+    classes: ClassTable | AnyPath | None = None
+    source_classes: ClassTable | AnyPath | None = None
     palette: PaletteName = "class"
 
     def __post_init__(self) -> None:
+        check_types(Scene, vars(self))
         FrameRange.of(self.frames)
         if self.every < 1:
             raise ArgumentError("every", expected="1 or more", found=str(self.every))
         check_choice("palette", self.palette, PALETTES)
         for name, table in (("classes", self.classes), ("source_classes", self.source_classes)):
-            if isinstance(table, str):
-                check_choice(name, table, TABLES)
+            table_of(table, name)
 
     def open(self, what: str | Iterable[str] | None = None) -> SceneReader:
         """Find the sequence, the grids, the frames and a common class table.
@@ -102,11 +111,13 @@ class Scene:
             MissingDataError: a sequence, grid or frame does not exist.
             FormatError: the data do not have the format.
         """
-        part = find_sequence(self.source, self.sequence)
+        part, given = find_sequence(self.source, self.sequence), table_of(self.source_classes)
+        if isinstance(part.sequence, VoxelSequence) and given is not None:
+            part, given = replace(part, sequence=part.sequence.with_classes(given)), None
         truth = None if self.truth is None else find_sequence(self.truth, part.sequence)
         contents = self._default_contents(part) if what is None else self._check_contents(what)
         grid = choose_grid(part, self.grid) if {"grid", "errors"} & set(contents) else ""
-        data = RemappedSequence(part.sequence, grid, stored=table_of(self.source_classes))
+        data = RemappedSequence(part.sequence, grid, stored=given)
         reference = None
         if truth is not None:
             reference = RemappedSequence(truth.sequence, choose_grid(truth, self.truth_grid))
@@ -247,6 +258,8 @@ def _open_part(source: AnyPath | Source) -> NamedPart | None:
     frame = layout.frame_of(path.name, path.suffix)
     is_scan = folder.name in layout.scan_folders()
     if frame is None or not (is_scan or (folder / layout.PARAMS).is_file()):
+        if find_voxels(path) is not None:
+            return None
         raise FormatError(
             path,
             expected=f"a file named by its frame number (six digits), in a folder of scans or "
@@ -259,9 +272,9 @@ def _open_part(source: AnyPath | Source) -> NamedPart | None:
     )
 
 
-def table_of(classes: ClassTable | str | None) -> ClassTable | None:
-    """Return a class table, which may be given by its name."""
-    return TABLES[classes] if isinstance(classes, str) else classes
+def table_of(classes: ClassTable | AnyPath | None, name: str = "classes") -> ClassTable | None:
+    """Return a class table, which may be given by its name or its file."""
+    return None if classes is None else read_classes(classes, name)[0].with_free_first
 
 
 def choose_grid(part: NamedPart, name: str | None) -> str:
@@ -559,6 +572,13 @@ class SceneReader:
     def table(self) -> ClassTable:
         """The class table of all grids and points."""
         return self.data.shown or self.data.stored_table
+
+    @property
+    def table_use(self) -> TableUse:
+        """The class table of the labels as they are stored, and what named it."""
+        if self.data.stored is not None:
+            return TableUse(self.data.stored.name, "option")
+        return self.data.sequence.table_use(self.data.grid)
 
     @cached_property
     def colors(self) -> ClassColors:

@@ -18,7 +18,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import BinaryIO, overload
 
-from carlasc.errors import ArgumentError, ConflictError
+from carlasc.core.classes import TableUse
+from carlasc.errors import ArgumentError, ConflictError, check_types
 from carlasc.storage.files import (
     AnyPath,
     check_target,
@@ -70,6 +71,7 @@ class ViewResult:
         size_bytes: size of the file, or of all files in the folder.
         elapsed_s: duration, seconds.
         notes: choices that were made for options that were not given.
+        source_classes: class table by which the labels were read, and what named it.
     """
 
     out: Path
@@ -79,6 +81,7 @@ class ViewResult:
     size_bytes: int
     elapsed_s: float
     notes: tuple[str, ...]
+    source_classes: TableUse
 
 
 @overload
@@ -151,6 +154,7 @@ def view(
         DependencyError: the SDK of Rerun or of Foxglove is missing; or for a window, Open3D or a
             library that it needs is missing, or there is no screen.
     """
+    check_types(view, locals())
     started, scene = time.monotonic(), as_scene(source)
     if scene.palette == "height":
         raise ArgumentError("palette", expected="class or colorblind", found="height")
@@ -200,7 +204,10 @@ def view(
     parts = [target] if ending else [path for path in target.rglob("*") if path.is_file()]
     size = sum(path.stat().st_size for path in parts)
     elapsed = time.monotonic() - started
-    return ViewResult(target, content.reader.path, titles, content.frames, size, elapsed, notes)
+    use = content.reader.table_use
+    return ViewResult(
+        target, content.reader.path, titles, content.frames, size, elapsed, notes, use
+    )
 
 
 def _write_recording(

@@ -50,7 +50,6 @@ from carlasc_converters.point_fields import (
     TIMES,
     PointClock,
     TimeUnit,
-    check_near,
     find_clock,
     named_fields,
     returns,
@@ -515,7 +514,6 @@ class BagFrame(FrameHandle):
         points, seconds = points[seen], None
         if message.pose is not None:
             points[:, :3] = transform_points(message.pose, points[:, :3])
-        check_near(points, where)
         points[:, 3] = np.nan_to_num(points[:, 3])
         if cloud.clock is not None:
             seconds = cloud.clock.seconds(message.columns, seen, message.stamp_ns, where)

@@ -27,11 +27,17 @@ from carlasc.converting import (
     VoxelContent,
 )
 from carlasc.core.arrays import FloatArray
-from carlasc.core.benchmarks import CARLAOCC, CARLAOCC_TO_CARLA
+from carlasc.core.benchmarks import CARLAOCC_TO_CARLA
 from carlasc.core.geometry import check_rigid
 from carlasc.core.grids import GridSpec
+from carlasc.core.tables import CARLAOCC
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.metrics.grids import CARLAOCC_GRIDS, read_geometry, read_voxels, sequence_name
+from carlasc_converters.carlaocc_voxels import (
+    CARLAOCC_GRIDS,
+    read_geometry,
+    read_voxels,
+    sequence_name,
+)
 from carlasc_converters.files import opening, read_text
 from carlasc_converters.ply import PlyVertices
 

@@ -8,7 +8,7 @@ from carlasc.converting import converter_names, load_converter, remaps_to_carla
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, DependencyError
-from carlasc.relabelling.predictions import read_table
+from carlasc.storage.class_files import read_classes
 
 
 def classes_given(name: str) -> tuple[ClassTable, Remap | None]:
@@ -45,7 +45,7 @@ def _table(name: str) -> ClassTable:
         if table.name == name:
             return table
     try:
-        return read_table(name)
+        return read_classes(name)[0]
     except ArgumentError as error:
         error.where = "source_classes"
         raise

@@ -14,7 +14,6 @@ import numpy as np
 from carlasc.core.arrays import (
     AnyArray,
     BoolArray,
-    Float32Array,
     FloatArray,
     Uint8Array,
     Uint32Array,
@@ -120,8 +119,6 @@ _NANOSECONDS: dict[TimeUnit, int] = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns":
 _SCAN_S = (0.004, 0.6)  # duration of a scan: 2 to 200 Hz; fact: scan-duration
 _LONGEST_S = 3.0  # no scan takes longer, whatever its unit is; fact: longest-scan
 _CLOCK_S = 1.0  # a scan begins within this time of its own time: other times are those of a clock
-_SAMPLE = 4000  # points of a scan that say how far away they are
-_FARTHEST_M = 2000.0  # no LiDAR on a vehicle sees so far
 
 
 @dataclass(frozen=True)
@@ -286,24 +283,6 @@ def named_fields(
         if (values := given[field]) is not None:
             fields[field] = whole_numbers(values, f"{where}: {field}")
     return fields
-
-
-def check_near(points: Float32Array, where: str) -> None:
-    """Check that (N, 4) points are so near that a sensor at the origin can see them.
-
-    Raises:
-        FormatError: half of them are farther away.
-    """
-    sample = np.abs(points[:: max(1, len(points) // _SAMPLE), :3]).max(axis=1)
-    far_m = float(np.nanmedian(sample)) if np.isfinite(sample).any() else 0.0
-    if far_m > _FARTHEST_M:
-        raise FormatError(
-            where,
-            expected="points in the frame of the sensor, in metres",
-            found=f"half of them more than {far_m / 1000:,.0f} km away",
-            advice="they are in the world frame (such as UTM), or in millimetres: transform them "
-            "by the inverse of the pose of each scan",
-        )
 
 
 def _column(columns: Columns, field: str) -> AnyArray | None:

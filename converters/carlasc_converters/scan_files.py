@@ -21,7 +21,6 @@ from carlasc_converters.files import opening
 from carlasc_converters.point_fields import (
     PointClock,
     TimeUnit,
-    check_near,
     named_fields,
     returns,
     whole_numbers,
@@ -106,7 +105,6 @@ class ScanFile(FrameHandle):
         points[:, 3] = np.nan_to_num(points[:, 3])
         if self.world_T_scan is not None:
             points[:, :3] = transform_points(invert(self.world_T_scan), points[:, :3])
-        check_near(points, path)
         if not np.array_equal(self.options.axes, np.eye(4)):
             points = points.copy()
             points[:, :3] = points[:, :3] @ self.options.axes[:3, :3].T.astype(np.float32)

@@ -15,18 +15,17 @@ import numpy as np
 
 from carlasc.converting import Converter, FrameHandle, Recording, Sensor, Trajectory
 from carlasc.core.arrays import AnyArray, FloatArray, IntArray
-from carlasc.core.geometry import Transform, invert, slerp
+from carlasc.core.geometry import Transform, axes_named, invert, slerp
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.motion.ground import find_ground
-from carlasc_converters.calibration_file import axes_named, in_axes, read_calibration
+from carlasc_converters.calibration_file import in_axes, read_calibration
 from carlasc_converters.files import raw_advice, sequence_name
 from carlasc_converters.given_classes import classes_given
 from carlasc_converters.pcd import PcdHeader, read_header
 from carlasc_converters.point_fields import (
     PointClock,
     TimeUnit,
-    check_near,
     find_clock,
     named_fields,
     point_seconds,
@@ -249,10 +248,7 @@ class ScanFolder(Recording):
     def _first(self) -> dict[str, AnyArray]:
         """The fields of the first scan."""
         path, columns = self._samples[0]
-        fields = named_fields(columns, str(path), self._clock)
-        if not self._in_world:
-            check_near(fields["points"], str(path))
-        return fields
+        return named_fields(columns, str(path), self._clock)
 
     @cached_property
     def _clock(self) -> PointClock | None:

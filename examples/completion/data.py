@@ -225,7 +225,7 @@ class TrainLoader:
         self.batch_size = config.batch_size
         self.sampler: EpochSampler | ShardSampler
         if _share_files(data):
-            self.sampler = ShardSampler(data, seed=config.seed, rank=rank, world=world)
+            self.sampler = ShardSampler(data, seed=config.seed, rank=rank, num_replicas=world)
         else:
             self.sampler = EpochSampler(data, world, rank, shuffle=True, seed=config.seed)
         samples: Any = Kept(data, config) if config.keep_samples else data

@@ -16,9 +16,8 @@ from converters.formats.carlaocc import (
 import carlasc
 from carlasc import FromScans
 from carlasc.converting import convert
-from carlasc.core.benchmarks import CARLAOCC
 from carlasc.core.grids import GridSpec
-from carlasc.core.tables import CARLA
+from carlasc.core.tables import CARLA, CARLAOCC
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
 from carlasc.groundtruth import GridOptions
 from carlasc.running import Run

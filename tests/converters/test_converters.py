@@ -286,7 +286,8 @@ def test_any_sink_will_do(tmp_path):
     assert {(name, frame) for name, frame in kept.fields} == {
         (name, frame) for name in ("points", "labels", "flow", "instances") for frame in range(3)
     }
-    assert {"poses.txt", "times.txt", "carlasc.json", "cameras.json"} == set(kept.texts)
+    texts = {"poses.txt", "times.txt", "carlasc.json", "cameras.json", ".carlasc/conversion.json"}
+    assert set(kept.texts) == texts
     with pytest.raises(ArgumentError, match="convert to a folder or a .zarr store"):
         convert("kitti", tmp_path / "in", sink)
 

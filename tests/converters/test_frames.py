@@ -188,7 +188,7 @@ def test_poses_are_relative_to_the_first_frame_and_in_the_frame_of_the_first_sen
     recording = recording_of(world)
     recording.sensors = (Sensor("roof", translation((1.0, 0.0, 1.5)) @ rotation_z(0.5)),)
     times = times_of(recording)
-    trajectory = read_trajectory(recording, times, PoseOptions("auto"))
+    trajectory = read_trajectory(recording, PoseOptions("auto"))
     poses = scan_poses(trajectory, recording, times)
     scans = world @ translation((1.0, 0.0, 1.5))  # the axes are those of the vehicle
     np.testing.assert_allclose(poses, np.linalg.inv(scans[0]) @ scans, atol=1e-12)
@@ -219,7 +219,7 @@ def test_one_pose_with_a_time_is_not_that_of_many_scans():
     with pytest.raises(
         FormatError, match="memory: expected poses over the time of 2 scans, found one pose: copy"
     ):
-        read_trajectory(recording, times_of(recording), PoseOptions("auto"))
+        read_trajectory(recording, PoseOptions("auto"))
 
 
 def test_poses_at_their_own_times_are_interpolated():
@@ -228,7 +228,7 @@ def test_poses_at_their_own_times_are_interpolated():
     recording.poses = lambda *, force=False: Trajectory(turning, np.array([10.0, 10.2]))
     recording.times = lambda: np.array([10.05, 10.1])
     times = times_of(recording)
-    poses = scan_poses(read_trajectory(recording, times, PoseOptions("auto")), recording, times)
+    poses = scan_poses(read_trajectory(recording, PoseOptions("auto")), recording, times)
     half = translation((1, 0, 0)) @ rotation_z(0.2)
     quarter = translation((0.5, 0, 0)) @ rotation_z(0.1)
     np.testing.assert_allclose(poses[1], np.linalg.inv(quarter) @ half, atol=1e-12)
@@ -245,13 +245,13 @@ def test_the_jitter_of_poses_is_told_from_the_motion_of_the_vehicle():
 
 
 def test_poses_of_the_file_are_not_read_where_they_are_to_be_estimated():
-    poses, times = np.tile(np.eye(4), (2, 1, 1)), np.arange(2.0)
-    assert read_trajectory(recording_of(poses), times, PoseOptions("kiss-icp")) is None
-    assert read_trajectory(recording_of(None), times, PoseOptions("auto")) is None
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    assert read_trajectory(recording_of(poses), PoseOptions("kiss-icp")) is None
+    assert read_trajectory(recording_of(None), PoseOptions("auto")) is None
     with pytest.raises(MissingDataError, match="memory: expected a file of poses, found none"):
-        read_trajectory(recording_of(None), times, PoseOptions("file"))
+        read_trajectory(recording_of(None), PoseOptions("file"))
     with pytest.raises(FormatError, match="expected a pose for each frame up to 1, found 1 lines"):
-        read_trajectory(recording_of(poses[:1]), times, PoseOptions("file"))
+        read_trajectory(recording_of(poses[:1]), PoseOptions("file"))
 
 
 def driving(speed, seconds):

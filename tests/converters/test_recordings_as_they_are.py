@@ -15,7 +15,6 @@ from carlasc_converters.bag import Bag
 from carlasc_converters.bag_messages import decompressed
 from carlasc_converters.files import MAX_UNPACKED
 from carlasc_converters.point_fields import (
-    check_near,
     find_clock,
     named_fields,
     point_seconds,
@@ -28,6 +27,7 @@ from carlasc_converters.scans import Scans
 from helpers.converters import bags
 from helpers.errors import raises
 
+from carlasc.converting.plausibility import check_scan
 from carlasc.core.geometry import quaternions_of, transform_points, translation
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.testing import SimulatedDrive
@@ -143,7 +143,7 @@ def test_a_curvature_and_a_flag_are_no_times_and_are_named():
 def test_points_farther_than_a_sensor_can_see_are_refused(offset):
     columns = {axis: np.linspace(1, 9, 20) + add for axis, add in zip("xyz", offset, strict=True)}
     with raises(FormatError, where="scan", expected="frame of the sensor", advice="world frame"):
-        check_near(named_fields(columns, "scan")["points"], "scan")
+        check_scan(named_fields(columns, "scan")["points"], None, "scan")
 
 
 @pytest.mark.parametrize(

@@ -98,11 +98,34 @@ def test_carla_0914_tags_become_ours():
     ]
 
 
-def test_ids_beyond_the_vote_channels_are_named():
-    CARLA.check(np.array([0, 24], np.uint32), "a.label")
+def test_ids_that_are_no_class_are_named():
+    CARLA.check(np.array([0, 22], np.uint32), "a.label")
     with pytest.raises(FormatError) as error:
-        CARLA.check(np.array([0, 30, 30], np.uint32), "a.label")
-    assert (error.value.where, error.value.found) == ("a.label", "30 in 2 of 3 labels")
+        CARLA.check(np.array([0, 30, 30, 24], np.uint32), "a.label")
+    assert error.value.where == "a.label"
+    assert error.value.found == "24 (1 times), 30 (2 times) of 4 labels"
+
+
+@pytest.mark.parametrize(
+    ("table", "ids", "proposed"),
+    [
+        (CARLA, [7, 24], "carla0.9.14"),  # vote channels of the format, but no classes of it
+        (SEMANTICKITTI, [0, 3, 19], "semantickitti19"),
+        (CARLA, [0, 29], "carlaocc"),
+        (SEMANTICKITTI, [0, 17, 200], None),
+    ],
+)
+def test_ids_without_a_class_are_refused_with_a_table_that_has_them(table, ids, proposed):
+    with pytest.raises(FormatError) as error:
+        table.check(np.array(ids, np.uint16), "a.label")
+    assert (f'"classes": "{proposed}"' in error.value.advice) == (proposed is not None)
+
+
+def test_a_table_whose_free_id_is_another_is_read_with_free_first():
+    first = TABLES["occnet"].with_free_first
+    assert (first.names[0], first.names[16], first.free) == ("free", "car", 0)
+    assert 16 in first.movable and 0 not in first.movable
+    assert CARLA.with_free_first is CARLA
 
 
 def test_weights_follow_the_published_rule():

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from helpers.datasets.drives import write_drive
 
-from carlasc import Dataset, GridSpec, collate
+from carlasc import Augment, Dataset, GridSpec, collate
 from carlasc.core import CameraModel
 from carlasc.core.cameras import optical_axes
 from carlasc.dataset import ResizeImages
-from carlasc.dataset.transforms import flip
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.storage import FolderSink
 from carlasc.storage.camera_files import cameras_to_json, encode_image
@@ -53,8 +52,30 @@ def test_samples_have_the_images_of_frames_that_have_all(data):
         "front",
         "other",
     ]
-    with pytest.raises(ArgumentError, match="a sample without images and cameras"):
-        flip(sample, "y", SPEC)
+
+
+def test_moved_points_are_seen_in_the_same_pixels_by_moved_cameras(data):
+    augment = Augment(
+        directions="xy", probability=1, rotate_rad=(0.7,), scale=0.3, translate_m=(1, 2, 3), seed=4
+    )
+    dataset = Dataset(data[0], fields=("points", "images", "cameras"))
+    before = dataset[0]
+    dataset.transform = augment
+    after = dataset[0]
+    for name, camera in before["cameras"].items():
+        assert np.array_equal(after["images"][name], before["images"][name])
+        moved = after["cameras"][name]
+        pixels = [
+            one.project(
+                (
+                    np.column_stack([points, np.ones(len(points))])
+                    @ np.linalg.inv(one.sensor_T_camera).T
+                )[:, :3]
+            )
+            for one, points in ((camera, before["points"]), (moved, after["points"]))
+        ]
+        assert np.isfinite(pixels[0]).any()
+        np.testing.assert_allclose(pixels[1], pixels[0], atol=0.02)
 
 
 def test_resized_images_have_matrices_that_fit(data):

@@ -243,7 +243,7 @@ def test_an_epoch_goes_on_with_another_number_of_processes(drives):
     state = one.state_dict(trained=3 * BATCH)
     ranks = []
     for rank in range(2):
-        sampler = ShardSampler(dataset, rank=rank, world=2, **SHAPE)
+        sampler = ShardSampler(dataset, rank=rank, num_replicas=2, **SHAPE)
         sampler.load_state_dict(state)
         ranks.append(frames_of(DataLoader(dataset, BATCH // 2, sampler=sampler)))
     rest = [frame for pair in zip(*ranks, strict=True) for frame in pair]

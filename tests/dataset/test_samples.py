@@ -61,7 +61,7 @@ def test_every_field_has_the_documented_shape_and_type(world):
     }
     assert found == {
         "occupancy": ("uint8", (3, 16, 16, 4)),
-        "density": ("uint16", (3, 16, 16, 4)),
+        "density": ("int32", (3, 16, 16, 4)),
         "visibility": ("uint8", (3, 16, 16, 4)),
         "labels": ("uint8", (16, 16, 4)),
         "known": ("bool", (16, 16, 4)),
@@ -305,7 +305,7 @@ def test_ids_over_255_are_not_wrapped(tmp_path):
     (folder / "evaluation" / "000000.label").write_bytes(labels.tobytes())
     raw = Dataset(tmp_path, remap=None, fields=("labels",))
     assert (
-        raw[0]["labels"].dtype == np.uint16
+        raw[0]["labels"].dtype == np.int32
         and (raw[0]["labels"] == 259).all()
         and raw.classes == SEMANTICKITTI
     )
@@ -455,7 +455,7 @@ def test_constructing_prints_nothing_and_loads_neither_torch_nor_numba(world):
         ),
         ({"fields": ()}, "fields: expected at least one"),
         ({"history": 0}, "history: expected a number of scans of 1 or more, found 0"),
-        ({"history": 2.5}, "history: expected a number of scans"),
+        ({"history": 2.5}, "history: expected a whole number, found 2.5"),
         (
             {"coordinates": "polar"},
             "coordinates: expected one of cartesian, cylindrical, found 'polar'",
@@ -587,7 +587,7 @@ def test_damaged_files_are_named_when_they_are_read(tmp_path):
     expect(
         FormatError, "evaluation/labels of frame 1: expected class ids of carla, found 77", tmp_path
     )
-    expect(FormatError, r"expected class ids 0\.\.24 .*, found 77", tmp_path, remap=None)
+    expect(FormatError, r"expected class ids of carla, found 77", tmp_path, remap=None)
     (folder / "evaluation" / "000001.label").write_bytes(b"1234")
     expect(FormatError, "000001.label: expected 4096 bytes", tmp_path)
     (folder / "labels" / "000001.label").write_bytes(bytes(8))

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.datasets.drives import write_drive
+from helpers.errors import raises
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -20,11 +21,22 @@ from carlasc.errors import ArgumentError
 SPEC = GridSpec("cartesian", (8, 8, 2), (-8.0, -8.0, -2.0), (8.0, 8.0, 1.0))
 
 
+class Numbers(Dataset):
+    """Stands in for a Dataset of sequences with these frames: only the numbers matter here."""
+
+    frames, is_cached = (), False
+
+    def __init__(self, frames, sequences, history):
+        self.frames, self.sequences, self.history = frames, sequences, history
+
+    def __repr__(self):
+        return f"sequences_of{self.frames}"
+
+
 def sequences_of(*frames, history=1):
-    """Stand in for a Dataset of sequences with these frames: only the numbers matter here."""
     named = tuple(SimpleNamespace(name=f"Town{k}") for k in range(len(frames)))
     arrays = tuple(np.array(sorted(numbers), np.int64) for numbers in frames)
-    return SimpleNamespace(frames=arrays, sequences=named, history=history, is_cached=False)
+    return Numbers(arrays, named, history)
 
 
 data = st.lists(st.sets(st.integers(0, 150), min_size=1, max_size=60), min_size=1, max_size=4).map(
@@ -45,7 +57,7 @@ def steps(dataset, world, batch, shape, state=None):
     """
     drawn = []
     for rank in range(world):
-        sampler = ShardSampler(dataset, rank=rank, world=world, **shape)
+        sampler = ShardSampler(dataset, rank=rank, num_replicas=world, **shape)
         if state:
             sampler.load_state_dict(state)
         indices = list(sampler)
@@ -92,7 +104,7 @@ def test_it_goes_on_at_any_position_with_any_other_number_of_processes(
     dataset, shape, epoch, part, before, after
 ):
     count = samples_in(dataset)
-    first = ShardSampler(dataset, rank=before - 1, world=before, **shape)
+    first = ShardSampler(dataset, rank=before - 1, num_replicas=before, **shape)
     first.set_epoch(epoch)
     taken = iter(first)
     for _ in range(int(part * len(first))):
@@ -216,12 +228,25 @@ def test_the_state_of_other_data_or_another_order_is_refused(change):
 
 @pytest.mark.parametrize(
     "name, value",
-    [("seed", -1), ("shard", 0), ("window", 0), ("world", 0), ("rank", 1), ("read_ahead", -1)],
+    [
+        ("seed", -1),
+        ("shard", 0),
+        ("window", 0),
+        ("num_replicas", 0),
+        ("rank", 1),
+        ("read_ahead", -1),
+    ],
 )
 def test_wrong_arguments_are_named(name, value):
     with pytest.raises(ArgumentError) as error:
         ShardSampler(sequences_of(range(3)), **{name: value})
     assert error.value.where == name and error.value.expected
+
+
+def test_a_part_is_a_slice():
+    dataset = sequences_of(range(3))
+    with raises(ArgumentError, where="^dataset$", expected="a carlasc.Dataset", advice="a slice"):
+        ShardSampler(SimpleNamespace(dataset=dataset, indices=[0]))
 
 
 @settings(max_examples=10)

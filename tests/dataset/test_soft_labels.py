@@ -127,7 +127,7 @@ def test_the_other_fields_are_those_of_the_files(world):
         "posterior": ("float32", (11, *SPEC.size)),
         "occupied": ("float32", SPEC.size),
         "flags": ("uint8", SPEC.size),
-        "views": ("uint16", SPEC.size),
+        "views": ("int32", SPEC.size),
     }
     for name in ("occupied", "flags", "views"):
         np.testing.assert_array_equal(

@@ -53,7 +53,7 @@ def test_default_collate_takes_every_dense_field_as_it_is(world):
         name: value.dtype for name, value in batch.items() if isinstance(value, torch.Tensor)
     } == {
         "occupancy": torch.uint8,
-        "density": torch.uint16,
+        "density": torch.int32,
         "visibility": torch.uint8,
         "labels": torch.uint8,
         "known": torch.bool,

@@ -219,11 +219,12 @@ def test_every_convention_scores_the_same_frames_or_says_why_not(folders, world)
     impossible = found.pop("occ3d-camera")
     assert "which voxels a camera observed" in str(impossible)
     known = sum(int((counts > 0).sum()) for counts in world[1].values())
+    whole = ("openoccupancy", "surroundocc", "occnet")  # have no mask of known voxels
     for name, result in found.items():
         assert result.frames == 6, name
         alone = evaluate(*folders, convention=name)
         assert alone.matrix == result.matrix
-        assert result.matrix.total <= (6 * np.prod(SHAPE) if name == "openoccupancy" else known)
+        assert result.matrix.total <= (6 * np.prod(SHAPE) if name in whole else known)
     assert len({round(r.miou, 6) for r in found.values() if not np.isnan(r.miou)}) > 3
 
 

@@ -13,8 +13,9 @@ from carlasc.core import ClassTable
 from carlasc.core.frames import FrameRange
 from carlasc.core.tables import CARLA, CARLASC11, SEMANTICKITTI, SEMANTICKITTI19, to_table
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.relabelling.predictions import PredictionReader, find_predictions, read_table
+from carlasc.relabelling.predictions import PredictionReader, find_predictions
 from carlasc.storage import open as open_store
+from carlasc.storage.class_files import read_classes
 from carlasc.storage.layout import CERTAIN
 from carlasc.testing import write_dataset
 from carlasc.testing.data import SCANS, WHOLE
@@ -259,16 +260,20 @@ def test_a_folder_without_predictions_is_one_line(sequences, tmp_path, make):
 
 def test_a_class_table_is_a_name_a_table_or_a_file(tmp_path):
     own = ClassTable("mine", {0: "free", 1: "wall"}, {0: (0, 0, 0), 1: (9, 9, 9)})
-    assert read_table("semantickitti19") is SEMANTICKITTI19 and read_table(own) is own
+    assert read_classes("semantickitti19")[0] is SEMANTICKITTI19 and read_classes(own)[0] is own
     (tmp_path / "own.json").write_text(json.dumps(own.to_dict()))
     (tmp_path / "carlasc.json").write_text(json.dumps({"format": 2, "classes": own.to_dict()}))
     (tmp_path / "named.json").write_text(json.dumps({"format": 2, "classes": "semantickitti"}))
-    assert read_table(tmp_path / "own.json") == own == read_table(str(tmp_path / "carlasc.json"))
-    assert read_table(tmp_path / "named.json") is SEMANTICKITTI
+    assert (
+        read_classes(tmp_path / "own.json")[0]
+        == own
+        == read_classes(str(tmp_path / "carlasc.json"))[0]
+    )
+    assert read_classes(tmp_path / "named.json")[0] is SEMANTICKITTI
     (tmp_path / "bad.json").write_text('{"names": {"0": "a"}}')
     with pytest.raises(FormatError) as error:
-        read_table(tmp_path / "bad.json")
+        read_classes(tmp_path / "bad.json")[0]
     assert error.value.where.endswith("bad.json: classes")
     with pytest.raises(ArgumentError) as error:
-        read_table("kitti")
+        read_classes("kitti")[0]
     assert error.value.where == "classes" and error.value.found == "'kitti'"

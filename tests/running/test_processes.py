@@ -119,10 +119,10 @@ def test_workers_that_cannot_start_are_one_clear_line(tmp_path: Path):
         "    raise SystemExit(f'{type(error).__name__}: {error}')\n"
     )
     result = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
-    assert (
-        "CarlascError: worker processes die as soon as they start: "
-        in result.stderr.splitlines()[-1]
-    )
+    lines = [line for line in result.stderr.splitlines() if "CarlascError: " in line]
+    assert result.returncode == 1
+    assert lines == [lines[0]]
+    assert lines[0].startswith("CarlascError: worker processes die as soon as they start: ")
 
 
 def test_stopping_in_the_middle_ends_the_workers_at_once_and_leaves_no_half_file(tmp_path: Path):

@@ -45,9 +45,10 @@ from carlasc.motion import (
     static_actor_points,
 )
 from carlasc.motion.tracks import MovingActors
+from carlasc.running.spreading import Run
 from carlasc.storage import layout
-from carlasc.storage.protocol import Sequence
-from carlasc.storage.resuming import scans_digest
+from carlasc.storage.inputs import SequenceFiles, combined, content_digests
+from carlasc.storage.protocol import Sequence, SequenceWriter
 from carlasc.storage.views import SequenceView
 
 _ACTOR_POINTS = (
@@ -127,6 +128,7 @@ class ScanFeed:
         min_range_m: nearer points are left out, in metres.
         max_range_m: farther points are left out, in metres.
         key: the same for all copies of a feed.
+        contents: digest of each scan that was compared.
     """
 
     def __init__(self, sequence: Sequence, options: FromScans) -> None:
@@ -146,6 +148,7 @@ class ScanFeed:
         self._free: FreeSpace | None = None
         self._lock = threading.RLock()  # an executor may be of threads
         self.key = uuid4().hex
+        self.contents: dict[int, str] = {}
 
     def __reduce__(self) -> tuple[Callable[..., ScanFeed], tuple[Any, ...]]:
         return _restore, (self.key, without_caches(self.sequence), self.options)
@@ -160,14 +163,19 @@ class ScanFeed:
     def with_poses_of(self, sequence: Sequence) -> ScanFeed:
         """Return a feed of the same scans under the poses of `sequence`."""
         other = ScanFeed(sequence, self.options)
-        if "digest" in vars(self):
-            other.digest = self.digest
+        other.contents = self.contents
         return other
 
-    @cached_property
-    def digest(self) -> str:
-        """Digest of some scans, which identifies derived results of the sequence."""
-        return scans_digest(self.sequence, self.frames)
+    def digest(self, writer: SequenceWriter | None, run: Run) -> str:
+        """Return the digest of all scans, which identifies derived results of the sequence.
+
+        Args:
+            writer: keeps the digest of each scan.
+            run: how the reading of scans is spread.
+        """
+        if missing := [frame for frame in self.frames.tolist() if frame not in self.contents]:
+            self.contents |= content_digests(SequenceFiles(self.sequence), missing, writer, run=run)
+        return combined(*(self.contents[frame] for frame in self.frames.tolist()))
 
     @cached_property
     def frames(self) -> IntArray:
@@ -191,7 +199,7 @@ class ScanFeed:
             return False
         ground = sorted(self.classes.ground)
         return not any(
-            np.isin(self.sequence.read("labels", frame), ground).any() for frame in self._sampled
+            np.isin(self.sequence.read("labels", frame), ground).any() for frame in self.sampled
         )
 
     @cached_property
@@ -200,7 +208,7 @@ class ScanFeed:
         classes.
         """
         scans = (
-            [self._voting_points(frame) for frame in self._sampled] if self.classes.ground else []
+            [self._voting_points(frame) for frame in self.sampled] if self.classes.ground else []
         )
         on_ground = [_labels(scan)[ground_points(scan.points)] for scan in scans]
         others = sum(
@@ -210,7 +218,7 @@ class ScanFeed:
         return self.has_labels and others <= _OTHERWISE * sum(map(len, on_ground))
 
     @property
-    def _sampled(self) -> list[int]:
+    def sampled(self) -> list[int]:
         """Some frames with labels. Other frames may have none."""
         labelled = self.sequence.frames("labels")
         chosen = (

@@ -275,13 +275,15 @@ class Kept:
     key: str
 
     @classmethod
-    def of(cls, writer: SequenceWriter | None, name: str, feed: ScanFeed, **settings: Any) -> Kept:
+    def of(
+        cls, writer: SequenceWriter | None, name: str, feed: ScanFeed, run: Run, **settings: Any
+    ) -> Kept:
         """Return the file for the scans of a feed."""
         if writer is None:
             return cls(writer, name, "")
         # The digest of scans, not of poses, is given: `derived_key` adds the given poses.
         settings = {"range_m": [feed.min_range_m, str(feed.max_range_m)], **settings}
-        args = feed.sequence, feed.frames, feed.digest
+        args = feed.sequence, feed.frames, feed.digest(writer, run)
         return cls(writer, name, derived_key(*args, version=_VERSIONS[name], **settings))
 
     def read(self, parse: Callable[[bytes, str], tuple[Result, str]]) -> Result | None:
@@ -311,7 +313,7 @@ def refine_sequence(
         steps: called with the number of scans that were read since the last call.
     """
     frames, mode = feed.frames.tolist(), feed.options.poses.refine
-    file = Kept.of(writer, POSES, feed, refine=mode, movable=sorted(feed.classes.movable))
+    file = Kept.of(writer, POSES, feed, run, refine=mode, movable=sorted(feed.classes.movable))
     refined = file.read(RefinedPoses.from_bytes)
     if refined is not None:
         steps(len(frames))

@@ -4,7 +4,7 @@ of the trajectory.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -47,6 +47,7 @@ from carlasc.motion.tracks import FIRST_FOUND, MovingActors, is_doubtful
 from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath
+from carlasc.storage.inputs import combined
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 from carlasc.storage.resuming import RECORD
 
@@ -98,7 +99,15 @@ class ScanFrame(FrameInput):
 
     def make(self, plan: GridPlan) -> FrameData:
         """Read the files of the frame, and count the votes of the scans in its window."""
-        feed = self.inputs.feed
+        feed, (first, last) = self.inputs.feed, self.inputs.feed.options.window
+        lost = [one for one in feed.sequence.awaited if first <= one - self.number <= last]
+        if lost:
+            raise MissingDataError(
+                f"frame {self.number}",
+                expected=f"the scan of frame {min(lost)}",
+                found="a frame that failed",
+                advice="repair that one, or finish without it with `allow_gaps=True`",
+            )
         fields = {name: feed.sequence.read(name, self.number) for name in self.fields()}
         window = feed.reaching(self.number, plan.spec)
         merged = merge_frame(plan, feed, self.inputs.actors, self.number, window)
@@ -190,6 +199,43 @@ class ScanSequence(StoredSequence):
         """Return a frame of the sequence, chosen or not; None if it has no scan."""
         return ScanFrame(self, number, number) if number in self.feed.frames else None
 
+    def depended(self) -> list[int]:
+        """Return all frames if actors or poses are found in them; otherwise those of windows, and
+        those in which classes are looked at.
+        """
+        feed = self.feed
+        if feed.needs_actors or self.refines or self.estimates_poses or self.plan.needs_all:
+            return feed.frames.tolist()
+        near = {other for one in self.frames for other in feed.window_of(one.number)}
+        return sorted(near | {*feed.sampled} | {one.number for one in self.frames})
+
+    def take_contents(self, contents: Mapping[int, str]) -> None:
+        """Take the digests of the files of frames, which identify actors and refined poses, too."""
+        self.feed.contents |= contents
+
+    def about(self, frame: int) -> object:
+        """Return the given pose and the time of a frame."""
+        pose = b"" if self.estimates_poses else self.posed.read_pose(frame).tobytes()
+        return pose, self.feed.time(frame)
+
+    def shared(self) -> object:
+        """Return what all frames depend on, besides the settings in params.json."""
+        return super().shared(), self.feed.min_range_m, self.feed.max_range_m
+
+    def available(self) -> Collection[int]:
+        """Return the frames with scans."""
+        return frozenset(self.feed.frames.tolist())
+
+    def made_from(self, number: int, own: Mapping[str, str], whole: str) -> str:
+        """Return a digest of the scans of the window, their poses, and the actors in it."""
+        feed, (first, last) = self.feed, self.options.window
+        if self.plan.needs_all or self.estimates_poses:
+            return whole
+        window = [*feed.window_of(number), number]
+        scans = [(other, own[str(other)], feed.pose(other).tobytes()) for other in window]
+        actors = self.actors.between(number + first, number + last).to_bytes("")
+        return combined(scans, actors, self.shared(), feed.must_find_ground)
+
     @property
     def steps_before(self) -> int:
         """Number of scans that the passes before the grids read: to refine poses, and to find
@@ -207,7 +253,7 @@ class ScanSequence(StoredSequence):
             self.use_refined(refine_sequence(self.feed, writer, run, steps))
         if self.feed.needs_actors:
             feed, speed = self.feed, self.options.motion.min_speed_m_s
-            file = Kept.of(writer, TRACKS, feed, motion=feed.motion, min_speed_m_s=speed)
+            file = Kept.of(writer, TRACKS, feed, run, motion=feed.motion, min_speed_m_s=speed)
             kept = file.read(MovingActors.from_bytes)
             if kept is None:
                 self.actors = find_actors(feed, run, steps)

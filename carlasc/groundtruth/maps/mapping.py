@@ -19,7 +19,7 @@ from carlasc.core.arrays import AnyArray, FloatArray, IntArray
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.geometry import invert, mirror_poses, transform_points
 from carlasc.core.grids import GridSpec, mirror_voxels
-from carlasc.errors import ArgumentError, MissingDataError
+from carlasc.errors import ArgumentError, MissingDataError, check_types
 from carlasc.groundtruth.from_scans.feed import ScanFeed, WithoutScans
 from carlasc.groundtruth.from_scans.merging import Merger
 from carlasc.groundtruth.from_scans.sequences import ScanSequence, scan_sequences
@@ -123,6 +123,7 @@ def map(
             estimated, and kiss-icp is not installed.
         StorageError: a file cannot be written.
     """
+    check_types(map, locals())
     began = time.perf_counter()
     if not (math.isfinite(cell_m) and cell_m >= _LEAST_CELL_M):
         raise ArgumentError(

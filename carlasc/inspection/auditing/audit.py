@@ -19,7 +19,7 @@ import numpy as np
 
 from carlasc.core.arrays import Uint8Array
 from carlasc.core.frames import Frames
-from carlasc.errors import ArgumentError, CarlascError, reading
+from carlasc.errors import ArgumentError, CarlascError, check_types, reading
 from carlasc.groundtruth import FromScans
 from carlasc.groundtruth.from_scans.feed import ScanFeed, WithoutScans
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
@@ -41,8 +41,9 @@ from carlasc.motion.tracks import MovingActors
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import FolderSink, layout
+from carlasc.storage.inputs import SequenceFiles, combined, content_digests
 from carlasc.storage.protocol import SequenceWriter, Source
-from carlasc.storage.resuming import derived_key, read_derived, scans_digest
+from carlasc.storage.resuming import derived_key, read_derived
 
 _VERSION = 2  # version of the counts: it changes when the same input gives other sums
 _STRETCH, _STRETCHES = 8, 10  # frames of a stretch, and least number of stretches of a sequence
@@ -154,6 +155,7 @@ def audit(
         MissingDataError: there are no grids, no scans, or none that belong together.
         FormatError: the geometry of the grids is not known.
     """
+    check_types(audit, locals())
     start = time.perf_counter()
     if made_from is not None and not made_from[0] <= 0 <= made_from[1]:
         raise ArgumentError(
@@ -211,7 +213,9 @@ def _stretches_of(
     """Yield the stretches of a sequence, without actors."""
     writer, digest, scans = None, "", one.scans.frames("points")
     if keep is not None:
-        writer, digest = FolderSink(keep).sequence(one.path), scans_digest(one.scans, scans)
+        writer = FolderSink(keep).sequence(one.path)
+        digests = content_digests(SequenceFiles(one.scans), scans.tolist(), writer)
+        digest = combined(*digests.items())
         if layout.POSES in one.scans.documents():
             digest = derived_key(one.scans, scans, digest)
     size = int(np.clip(len(one.frames) // _STRETCHES, 1, _STRETCH))

@@ -14,10 +14,7 @@ import numpy as np
 
 from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray, IntArray, LabelArray
 from carlasc.core.benchmarks import (
-    CARLAOCC,
     CARLAOCC_TO_CARLA,
-    OCC3D_TO_OPENOCCUPANCY,
-    SSCBENCH_TO_RAW,
     TO_OCC3D,
     TO_SSCBENCH,
 )
@@ -25,24 +22,27 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.geometry import Transform, transform_points
 from carlasc.core.grids import GridSpec
-from carlasc.core.tables import remaps_between
+from carlasc.core.tables import (
+    CARLAOCC,
+    OCC3D,
+    OCCNET,
+    OPENOCCUPANCY,
+    SSCBENCH_TO_RAW,
+    remaps_between,
+)
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, count, first_names, reading
-from carlasc.metrics.grids import CarlaOccGrids, GridFrames, SequenceGrid
-from carlasc.metrics.pairs import Place, TokenFrames, open_grids
+from carlasc.metrics.grids import SequenceGrid
+from carlasc.metrics.pairs import Place, open_grids
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import parse_json
 from carlasc.storage.layout import identity_of
 from carlasc.storage.protocol import Sequence
+from carlasc.storage.voxel_files import IGNORED_ID, GridFrames, VoxelFrames
 
 _SAME_TIME_S = 0.06  # a grid belongs to a scan if their times differ by less; fact: same-time
-_NOISE = 255
 _HEIGHT_M = 1.8  # height of the sensor above the ground in CarlaSC, used if the recording has none
 # table of times beside grids that are named by tokens: lines of a token and seconds
 _TIMES = "tokens.txt"
-_FRAMES = {
-    "occ3d-lidar": "the vehicle, with its origin on the ground",
-    "openoccupancy": "the LiDAR, x to the right and y forward",
-}
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,12 @@ class MatchedGrids:
     @property
     def frame_name(self) -> str:
         """The frame of the grids in words."""
-        place = _FRAMES.get(self.grids.benchmark or "", "the sensor, x forward")
-        return f"{place}; {self.axes}-handed"
+        return f"{self._format_place}; {self.axes}-handed"
+
+    @property
+    def _format_place(self) -> str:
+        grids = self.grids
+        return grids.format.place if isinstance(grids, VoxelFrames) else "the sensor, x forward"
 
     @cached_property
     def grid_T_scan(self) -> Transform:
@@ -110,7 +114,7 @@ class MatchedGrids:
         matrix: Transform = np.diag(
             [1.0, 1.0 if self.axes == self.scans.metadata.axes else -1.0, 1.0, 1.0]
         )
-        if self.grids.benchmark == "openoccupancy":
+        if "y forward" in self._format_place:
             matrix = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ matrix
         matrix[2, 3] = self.height_m
         return matrix
@@ -120,7 +124,7 @@ class MatchedGrids:
         """Whether the labels of the grids are mapped, not those of the scans: if several classes of
         the grids are one class of the scans.
         """
-        return isinstance(self.grids, CarlaOccGrids) and self.scans.metadata.classes != CARLAOCC
+        return self.grids.classes == CARLAOCC != self.scans.metadata.classes
 
     @property
     def classes(self) -> ClassTable | None:
@@ -165,9 +169,9 @@ class MatchedGrids:
             expected, advice = f"{self.spec.num_voxels} voxels", "check the size in params.json"
             raise FormatError(where, expected=expected, found=str(labels.size), advice=advice)
         labels = labels.reshape(self.spec.size)
-        occupied = labels != (17 if self.grids.benchmark == "occ3d-lidar" else 0)
-        if self.grids.benchmark in _FRAMES:
-            occupied &= labels != _NOISE
+        occupied = labels != (0 if self.grids.classes is None else self.grids.classes.free)
+        if isinstance(self.grids, VoxelFrames):
+            occupied &= labels != IGNORED_ID
         if self._many_to_one:
             labels = CARLAOCC_TO_CARLA(labels, where)
         if known is not None:
@@ -255,13 +259,14 @@ def _recording_of(
 
 def _match_frames(grids: GridFrames, scans: Sequence, chosen: FrameRange) -> MatchedGrids:
     numbers, own, notes = grids.frames().tolist(), scans.frames("points").tolist(), list[str]()
-    height = _height_of(scans) if grids.benchmark == "occ3d-lidar" else 0.0
+    on_ground = grids.classes == OCC3D
+    height = _height_of(scans) if on_ground else 0.0
     if height is None:
         height = _HEIGHT_M
         notes.append(f"the height of the sensor is not known: {height:g} m is assumed")
     result = MatchedGrids(grids, scans, (), (), (), height)
     _ = result.spec  # raises now, before work begins, if the geometry is unknown
-    if not isinstance(grids, TokenFrames):
+    if not isinstance(grids, VoxelFrames) or grids.numbered:
         pairs = [(number, number) for number in numbers if number in set(own)]
     elif (times := _token_times(grids)) is not None:
         seconds, pairs = np.array([*result.seconds.values()]), []
@@ -302,7 +307,7 @@ def _match_frames(grids: GridFrames, scans: Sequence, chosen: FrameRange) -> Mat
     )
 
 
-def _token_times(grids: TokenFrames) -> dict[str, float] | None:
+def _token_times(grids: VoxelFrames) -> dict[str, float] | None:
     """Return the seconds of tokens, from tokens.txt or Occ3D's annotations.json, in the folder of
     the scene or one above it.
     """
@@ -332,11 +337,12 @@ def _mapping(
     source: ClassTable, target: ClassTable, benchmark: str | None
 ) -> Mapping[int, int] | None:
     """Return the class of the grids for each class of the scans; None if no map is known."""
-    if benchmark in _FRAMES:
+    if target in (OCC3D, OPENOCCUPANCY, OCCNET):
         to_occ3d = TO_OCC3D.get(source.name)
-        if to_occ3d is None or benchmark == "occ3d-lidar":
+        if to_occ3d is None or target == OCC3D:
             return to_occ3d
-        return {old: OCC3D_TO_OPENOCCUPANCY.get(new, -1) for old, new in to_occ3d.items()}
+        ids = {name: i for i, name in target.names.items()} | {"free": target.free}
+        return {old: ids.get(OCC3D.names.get(new, ""), -1) for old, new in to_occ3d.items()}
     if benchmark == "sscbench" and source.name in TO_SSCBENCH:
         return {old: SSCBENCH_TO_RAW.get(new, -1) for old, new in TO_SSCBENCH[source.name].items()}
     mapping = {index: index for index in source.names}

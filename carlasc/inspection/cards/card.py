@@ -13,6 +13,7 @@ from carlasc.errors import (
     DependencyError,
     FormatError,
     MissingDataError,
+    check_types,
     count,
 )
 from carlasc.inspection.cards.card_tables import tables_of_card
@@ -98,6 +99,7 @@ def card(
         ConflictError: a card exists, and `overwrite` is not given.
         StorageError: the folder cannot be written to.
     """
+    check_types(card, locals())
     stated = None if about.license is None else license_given(about.license)
     opened = as_source(source)
     place, folder = place_of(source, None if out is None else Path(out), about.url)

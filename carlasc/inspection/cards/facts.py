@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_types
 from carlasc.groundtruth.reporting import Report
 from carlasc.inspection.cards.licenses import License, LicensedPart, licensed_parts
 from carlasc.inspection.overview import GridOverview, Overview, info
@@ -62,6 +62,7 @@ class CardDetails:
     published: str | None = None
 
     def __post_init__(self) -> None:
+        check_types(CardDetails, vars(self))
         version, address = r"\d+(\.\d+){0,2}([-+][0-9A-Za-z.-]+)?", r"https?://[^\s\"'<>]+"
         try:
             is_date = bool(datetime.date.fromisoformat(self.published or "2000-01-01"))

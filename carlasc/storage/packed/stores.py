@@ -15,7 +15,7 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray, IntArray
 from carlasc.core.grids import Coordinates
-from carlasc.errors import ArgumentError, FormatError, MissingDataError, within
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_types, within
 from carlasc.storage import layout
 from carlasc.storage.files import AnyPath, damaged, leads_outside, unfinished
 from carlasc.storage.layout import identity_of
@@ -45,6 +45,7 @@ class PackOptions:
     block: int = 16
 
     def __post_init__(self) -> None:
+        check_types(PackOptions, vars(self))
         if self.lossy_mm is not None and not 0 < self.lossy_mm <= 1000:
             raise ArgumentError(
                 "lossy_mm", expected="millimetres above 0, up to 1000", found=str(self.lossy_mm)

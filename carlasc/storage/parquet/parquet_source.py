@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -90,6 +90,10 @@ class ParquetSequence(PackedSequence["FieldTable"]):
             where = f"{self.location}/{layout.params_file(grid)}"
             raise damaged(where, "the geometry of the grid", "none")
         return table.read(frame, self.grids[grid].size if per_voxel else None)
+
+    def files_of(self, field: str, frames: Iterable[int]) -> list[str]:
+        """Return the table of a field."""
+        return [f"{self.folder}/{field}.parquet"]
 
     def read_document(self, name: str) -> bytes:
         """Return a text file's bytes."""

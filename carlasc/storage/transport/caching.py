@@ -11,7 +11,7 @@ import hashlib
 import os
 import stat
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 from filelock import FileLock, Timeout
 
-from carlasc.errors import ArgumentError, MissingDataError, StorageError
+from carlasc.errors import ArgumentError, MissingDataError, StorageError, check_types
 from carlasc.storage.files import AnyPath, sync_file, write_at
 from carlasc.storage.transport.remote_tree import RemoteTree
 from carlasc.storage.transport.trees import LocalTree, Tree
@@ -55,6 +55,7 @@ class Cache:
     max_bytes: int = 64 << 30
 
     def __post_init__(self) -> None:
+        check_types(Cache, vars(self))
         if self.max_bytes <= 0:
             raise ArgumentError(
                 "max_bytes", expected="a number of bytes above 0", found=str(self.max_bytes)
@@ -206,6 +207,10 @@ class CachedTree(Tree):
     def entries(self, folder: str = "") -> Mapping[str, bool]:
         """List the remote folder."""
         return self.remote.entries(folder)
+
+    def states(self, paths: Sequence[str]) -> dict[str, str]:
+        """Return the states of the remote files."""
+        return self.remote.states(paths)
 
     def is_file(self, path: str) -> bool:
         """Whether the file exists."""

@@ -79,9 +79,9 @@ class Client(ABC):
         """Return the names in a folder, mapped to whether they are folders."""
 
     @abstractmethod
-    def files(self, url: str) -> dict[str, int]:
-        """Return the sizes of all files below a folder by path relative to it, or that of the file
-        itself under "".
+    def files(self, url: str) -> dict[str, tuple[int, str]]:
+        """Return what `about` says of all files below a folder by path relative to it, or of the
+        file itself under "".
         """
 
     def put(self, url: str, data: bytes, mark: str | None = None) -> bool:
@@ -136,7 +136,7 @@ class FileSystemClient(Client):
             return None
         if info["type"] == "directory":
             return None
-        return info["size"], " ".join(str(info[name]) for name in _CHANGES if info.get(name))
+        return _described(info)
 
     def entries(self, url: str) -> dict[str, bool]:
         """List a folder."""
@@ -152,7 +152,7 @@ class FileSystemClient(Client):
         """Return the name of a folder in listings: some file systems list it among its files."""
         return str(self.connection.unstrip_protocol(url)).partition("://")[2].strip("/")
 
-    def files(self, url: str) -> dict[str, int]:
+    def files(self, url: str) -> dict[str, tuple[int, str]]:
         """List all files below a folder."""
         try:
             listed = self.connection.find(url, detail=True)
@@ -160,7 +160,7 @@ class FileSystemClient(Client):
             return {}
         root = self._own_name(url)
         return {
-            name.strip("/").removeprefix(root).lstrip("/"): about["size"]
+            name.strip("/").removeprefix(root).lstrip("/"): _described(about)
             for name, about in listed.items()
             if not name.endswith("/")
         }
@@ -187,3 +187,8 @@ class FileSystemClient(Client):
                 self.connection.rm_file(url)
             except FileNotFoundError:
                 continue
+
+
+def _described(info: Mapping[str, Any]) -> tuple[int, str]:
+    """Return the size of a file, and a text that changes with it."""
+    return info["size"], " ".join(str(info[name]) for name in _CHANGES if info.get(name))

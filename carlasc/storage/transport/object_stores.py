@@ -165,7 +165,7 @@ class ObjectStoreClient(Client):
                 if status_and_code(error)[1] == "NoSuchBucket":
                     raise
             return None
-        return about["size"], f"{about['e_tag'] or ''} {about['last_modified']}"
+        return _described(about)
 
     def entries(self, url: str) -> dict[str, bool]:
         """List a folder."""
@@ -176,14 +176,14 @@ class ObjectStoreClient(Client):
         places.pop(key, None)  # some programs store an object for the folder itself
         return {place.rstrip("/").rpartition("/")[2]: folder for place, folder in places.items()}
 
-    def files(self, url: str) -> dict[str, int]:
+    def files(self, url: str) -> dict[str, tuple[int, str]]:
         """List all objects below a folder."""
         key = self._key(url)
         listed = _library().list(self.connection[0], key).collect()
         if not listed and (about := self.about(url)) is not None:
-            return {"": about[0]}
+            return {"": about}
         return {
-            entry["path"].removeprefix(key).lstrip("/"): entry["size"]
+            entry["path"].removeprefix(key).lstrip("/"): _described(entry)
             for entry in listed
             if entry["path"] != key
         }
@@ -219,6 +219,11 @@ class ObjectStoreClient(Client):
                 _library().delete(store, key)
             except FileNotFoundError:
                 continue
+
+
+def _described(about: Any) -> tuple[int, str]:
+    """Return the size and the version of an object."""
+    return about["size"], f"{about['e_tag'] or ''} {about['last_modified']}"
 
 
 def _variable(*names: str) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import copy
 import io
 import os
+import posixpath
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache, partial
 from typing import Any, TypeVar
@@ -139,8 +140,22 @@ class RemoteTree(Tree):
 
     def sizes(self, folder: str = "") -> dict[str, int]:
         """Return the sizes of all files below a folder, or of the file itself, by path."""
+        return {path: size for path, (size, _) in self._versions(folder).items()}
+
+    def states(self, paths: Sequence[str]) -> dict[str, str]:
+        """Return the size and the version of each file, from one listing of the folder above."""
+        if not paths:
+            return {}
+        known = self._versions(posixpath.commonpath([posixpath.dirname(path) for path in paths]))
+        return {
+            path: f"{known[path][0]} {known[path][1]}" if known.get(path, (0, ""))[1] else ""
+            for path in paths
+        }
+
+    def _versions(self, folder: str) -> dict[str, tuple[int, str]]:
+        """Return the sizes and versions of all files below a folder, by path."""
         files = self.ask(self.client.files, (folder,))[0]
-        return {"/".join(filter(None, (folder, name))): size for name, size in files.items()}
+        return {"/".join(filter(None, (folder, name))): about for name, about in files.items()}
 
     def read_many(self, paths: Sequence[str], size: int | None = None) -> list[bytes | memoryview]:
         """Fetch the files, several at a time."""

@@ -11,7 +11,7 @@ import shutil
 import stat
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -83,6 +83,12 @@ class Tree(ABC):
         """Return several ranges; remote trees request all of them at once."""
         return [self.read_range(*part) for part in ranges]
 
+    def states(self, paths: Sequence[str]) -> dict[str, str]:
+        """Return a text for each file that changes with the file, or most of them: its size and its
+        time, or the version of an object; empty if it is not known.
+        """
+        return dict.fromkeys(paths, "")
+
     def refresh(self) -> None:  # noqa: B027 (most trees remember nothing)
         """Discard cached listings, because other processes may have written files."""
 
@@ -124,6 +130,15 @@ class LocalTree(Tree):
     def is_file(self, path: str) -> bool:
         """Whether the file exists, without listing its folder."""
         return (self.root / path).is_file()
+
+    def states(self, paths: Sequence[str]) -> dict[str, str]:
+        """Return the size of each file, and the time of its last modification in nanoseconds."""
+        found = dict.fromkeys(paths, "")
+        for path in paths:
+            with suppress(OSError):
+                about = os.stat(f"{self.location}/{path}")
+                found[path] = f"{about.st_size} {about.st_mtime_ns}"
+        return found
 
     def read_many(self, paths: Sequence[str], size: int | None = None) -> list[bytes | memoryview]:
         """Read the files, or map them into memory."""

@@ -170,14 +170,14 @@ class WebClient(Client):
                 names[unquote(name)] = bool(slash)
         return names
 
-    def files(self, url: str) -> dict[str, int]:
+    def files(self, url: str) -> dict[str, tuple[int, str]]:
         """List all files below a folder."""
         if (about := self.about(url)) is not None:
-            return {"": about[0]}
+            return {"": about}
         return {
-            f"{name}/{path}".rstrip("/"): size
+            f"{name}/{path}".rstrip("/"): own
             for name in self.entries(url)
-            for path, size in self.files(f"{url}/{name}").items()
+            for path, own in self.files(f"{url}/{name}").items()
         }
 
 

@@ -77,6 +77,10 @@ class ZipTree(Tree):
         """Whether a member of that name exists."""
         return self._number(path) >= 0
 
+    def states(self, paths: Sequence[str]) -> dict[str, str]:
+        """Return the state of the zip for each member."""
+        return dict.fromkeys(paths, self.tree.states([self.path])[self.path])
+
     def sizes(self) -> dict[str, int]:
         """Return the unpacked sizes of all files, by path."""
         columns, folders = self._index

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from carlasc.core.arrays import AnyArray
-from carlasc.errors import ConflictError, MissingDataError
+from carlasc.errors import ConflictError, MissingDataError, check_types
 from carlasc.storage.files import AnyPath, damaged, parse_json, remove_stale, to_json
 from carlasc.storage.packed.array_layout import (
     FIELD,
@@ -120,6 +120,7 @@ def finish(
         FormatError: a file of the store is damaged.
         MissingDataError: `out` is not a zarr store of the present version.
     """
+    check_types(finish, locals())
     target = target_of(out, **storage_options)
     if isinstance(target, LocalTarget):
         remove_stale(target.folder)

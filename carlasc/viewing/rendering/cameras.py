@@ -18,7 +18,7 @@ from carlasc.core.arrays import Float32Array, FloatArray
 from carlasc.core.choices import Axes, ViewName
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, rotate_vectors, transform_points
-from carlasc.errors import ArgumentError, check_choice
+from carlasc.errors import ArgumentError, check_choice, check_types
 
 Floats = FloatArray
 
@@ -160,6 +160,7 @@ class CameraOptions:
     still: bool = False
 
     def __post_init__(self) -> None:
+        check_types(CameraOptions, vars(self))
         check_choice("view", self.view, ViewName)
 
     @property

@@ -72,8 +72,9 @@ def overlay(
         10.0 if fps is None else fps,
     )
     took, path, table = time.monotonic() - started, reader.path, reader.table.name
+    size, use = (width, height), reader.table_use
     return RenderResult(
-        out, path, ("grid",), frames, len(frames), (width, height), table, took, reader.notes
+        out, path, ("grid",), frames, len(frames), size, table, took, reader.notes, None, use
     )
 
 

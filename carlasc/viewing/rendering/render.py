@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from carlasc.core.arrays import Uint8Array
-from carlasc.errors import ArgumentError
+from carlasc.core.classes import TableUse
+from carlasc.errors import ArgumentError, check_types
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import Sequence as StoredSequence
@@ -76,6 +77,7 @@ class RenderResult:
         elapsed_s: duration, seconds.
         notes: choices that were made for options that were not given, and empty parts of a picture.
         legend: the file of the legend if it is a separate file, or None.
+        source_classes: class table by which the labels were read, and what named it.
     """
 
     out: Path
@@ -88,6 +90,7 @@ class RenderResult:
     elapsed_s: float
     notes: tuple[str, ...]
     legend: Path | None = None
+    source_classes: TableUse | None = None
 
 
 def render(
@@ -142,6 +145,7 @@ def render(
         StorageError: `out` cannot be written; nothing is left behind.
         DependencyError: a package is missing; the message names the extra.
     """
+    check_types(render, locals())
     started = time.monotonic()
     together = not isinstance(source, _ONE)
     scenes = [as_scene(one) for one in ([source] if isinstance(source, _ONE) else source)]
@@ -196,6 +200,7 @@ def render(
         time.monotonic() - started,
         tuple(_notes_of(readers, pictures)),
         legend_file if entries else None,
+        readers[0].table_use,
     )
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from carlasc.core.choices import StyleName as StyleName  # noqa: PLC0414 (part of this module)
-from carlasc.errors import ArgumentError, check_choice
+from carlasc.errors import ArgumentError, check_choice, check_types
 
 SMALLEST, LARGEST = (64, 64), 16384  # pixels of a picture
 
@@ -59,6 +59,7 @@ class StyleOptions:
     ego: bool = True
 
     def __post_init__(self) -> None:
+        check_types(StyleOptions, vars(self))
         check_choice("style", self.name, StyleName)
         if self.dpi is not None and not 30 <= self.dpi <= 2400:
             raise ArgumentError("dpi", expected="30 to 2400 pixels per inch", found=f"{self.dpi:g}")

@@ -11,9 +11,9 @@ import numpy as np
 
 from carlasc import storage
 from carlasc.converting import Files
-from carlasc.core.benchmarks import IGNORED, SSCBENCH_TO_RAW, TO_SSCBENCH
+from carlasc.core.benchmarks import IGNORED, TO_SSCBENCH
 from carlasc.core.grids import GridSpec
-from carlasc.core.tables import SEMANTICKITTI, SEMANTICKITTI19
+from carlasc.core.tables import SEMANTICKITTI, SEMANTICKITTI19, SSCBENCH_TO_RAW
 from carlasc.errors import ArgumentError
 from carlasc_converters.exporters.grid_exporter import (
     GridExporter,

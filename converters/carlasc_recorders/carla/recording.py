@@ -21,7 +21,7 @@ from carlasc.captures.settings import (
     sensor_offsets,
 )
 from carlasc.captures.writing import CaptureWriter, TimesLog
-from carlasc.errors import ConflictError, MissingDataError, check_choice, import_extra
+from carlasc.errors import ConflictError, MissingDataError, check_choice, check_types, import_extra
 from carlasc.storage.camera_files import cameras_to_json
 from carlasc.storage.files import AnyPath
 from carlasc.storage.layout import CAMERAS
@@ -119,6 +119,7 @@ def record(
         ConflictError: `out` holds another capture, or the replay deviates from it.
         StorageError: `out` cannot be written to.
     """
+    check_types(record, locals())
     check_at_least(1, count=count, sensors=sensors)
     check_at_least(0, seed=seed)
     check_choice("traffic", traffic, TrafficLevel)

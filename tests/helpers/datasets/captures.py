@@ -42,10 +42,12 @@ def write_capture(
 
 def read_tree(folder: Path, leave_out: str = "raw") -> dict[str, bytes]:
     """Return the content of every file in a folder by its relative path, also of hidden files,
-    except in folders called `leave_out`.
+    except in folders called `leave_out`, and records of inputs, which have the times of files.
     """
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and leave_out not in path.relative_to(folder).parts
+        if path.is_file()
+        and leave_out not in path.relative_to(folder).parts
+        and not (path.suffix == ".json" and path.parent.name == ".carlasc")
     }

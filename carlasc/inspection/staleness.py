@@ -1,0 +1,109 @@
+"""Whether the grids of a sequence are of the scans, labels, poses and times that are beside them
+now, by the records of what they were made from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from carlasc.captures.raw import RAW, Capture
+from carlasc.core.frames import FrameRange
+from carlasc.errors import CarlascError
+from carlasc.groundtruth.from_capture import CaptureFiles
+from carlasc.inspection.findings import Finding
+from carlasc.storage.folder import FolderSequence
+from carlasc.storage.inputs import (
+    FrameFiles,
+    MadeFrom,
+    SequenceFiles,
+    combined,
+    content_digests,
+    describe_changes,
+)
+from carlasc.storage.protocol import Sequence, SequenceWriter
+
+_ADVICE = "make the grid again with the command that made it: it makes what changed again"
+
+
+class _Records(SequenceWriter):
+    """Reads the records of a sequence, and writes nothing."""
+
+    def __init__(self, sequence: Sequence) -> None:
+        self.sequence, self.location = sequence, sequence.location
+
+    def has(self, field: str, frame: int) -> bool:
+        return frame in self.sequence.frames(field)
+
+    def write(self, field: str, frame: int, array: object) -> None:
+        """Write nothing."""
+
+    def write_document(self, name: str, data: bytes) -> None:
+        """Write nothing."""
+
+    def read_document(self, name: str) -> bytes | None:
+        """Return a record; None if there is none, or the store does not list it."""
+        try:
+            return self.sequence.read_document(name)
+        except CarlascError:
+            return None
+
+
+def check_inputs(sequence: Sequence) -> Iterator[Finding]:
+    """Yield a finding for each grid whose inputs changed since it was made."""
+    for grid in sequence.grids:
+        if changes := changed_inputs(sequence, grid):
+            where = f"{sequence.location}/{grid}"
+            yield Finding("warning", "inputs", where, "what it was made from", changes, _ADVICE)
+
+
+def changed_inputs(sequence: Sequence, grid: str) -> str:
+    """Return what changed of the inputs of a grid since it was made, such as "scan 12 changed";
+    empty if nothing did, or if it is not known.
+    """
+    writer, made = _Records(sequence), sequence.params(grid).get("carlasc")
+    record = MadeFrom.read(writer, f"made-{grid}")
+    if not record.own or not isinstance(made, dict):
+        return ""
+    try:
+        files, known = _files(sequence, made)
+        if files is None:
+            return ""
+        window = [int(end) for end in str(made.get("window", "0:0")).split(":")]
+        near = {int(n) + i for n in record.frames for i in range(window[0], window[1] + 1)}
+        wanted = [frame for frame in known if str(frame) in record.own or frame in near]
+        contents = content_digests(files, wanted, writer)
+        estimated = made.get("poses") == "kiss-icp"
+        now = {
+            str(frame): combined(content, _about(sequence, made["observe"], frame, estimated))
+            for frame, content in contents.items()
+        }
+    except (CarlascError, OSError, KeyError, ValueError):  # which other checks report
+        return ""
+    # an output may have a part of the scans only, but none that its input has not
+    required = record.own if made["observe"] == "capture" else record.frames
+    before = {frame: own for frame, own in record.own.items() if frame in now or frame in required}
+    return describe_changes(before, now)
+
+
+def _files(sequence: Sequence, made: Mapping[str, object]) -> tuple[FrameFiles | None, list[int]]:
+    """Return the files that a grid was made from, if they are beside it, and their frames."""
+    if made["observe"] == "scans":
+        return SequenceFiles(sequence), sequence.frames("points").tolist()
+    if made["observe"] == "grid":
+        finer = [f"{made['grid']}/{part}" for part in ("labels", "counts")]
+        return SequenceFiles(sequence, *finer), sequence.frames(finer[0]).tolist()
+    if isinstance(sequence, FolderSequence) and (sequence.folder.parent / RAW).is_dir():
+        capture = Capture(sequence.folder.parent)
+        frames = FrameRange.of(str(made["frames"])).select(capture.frames)
+        return CaptureFiles(capture), frames.tolist()
+    return None, []
+
+
+def _about(sequence: Sequence, observe: str, frame: int, estimated: bool) -> object:
+    """Return what a run records of a frame besides its files (see `SequenceInput.about`)."""
+    if observe == "capture":
+        return None
+    if observe == "grid":
+        return []
+    pose = b"" if estimated else sequence.read_pose(frame).tobytes()
+    return pose, float(sequence.times_of([frame])[0])

@@ -1,0 +1,270 @@
+"""A run after a change of its inputs gives what a run into an empty folder gives."""
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.datasets.captures import write_capture
+from helpers.scenes.passing_car import write_sequence
+
+import carlasc
+from carlasc import FromGrid, FromScans, GridSpec, Run, regrid
+from carlasc.motion import PoseOptions
+from carlasc.running import Part
+
+SPEC = GridSpec("cartesian", (32, 32, 8), (-12.8, -12.8, -2.0), (12.8, 12.8, 1.2))
+FRAMES = 9
+ALONE = Run(workers=1)
+STILL = FromScans(window=(-2, 2), dynamic="tube", poses=PoseOptions("file", "never"))
+
+
+def outputs(folder: Path) -> dict[str, bytes]:
+    """Return all files below a folder, without records."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and ".carlasc" not in path.parts
+    }
+
+
+def scans(folder: Path) -> Path:
+    return folder / "Val" / "Street" / "cartesian"
+
+
+def change_points(folder: Path, rng: np.random.Generator) -> None:
+    path = scans(folder) / f"velodyne/{rng.integers(FRAMES):06d}.bin"
+    points = np.fromfile(path, np.float32).reshape(-1, 4)
+    points[:, 2] += np.float32(0.3)
+    points.tofile(path)
+
+
+def change_labels(folder: Path, rng: np.random.Generator) -> None:
+    path = scans(folder) / f"labels/{rng.integers(FRAMES):06d}.label"
+    labels = np.fromfile(path, np.uint32)
+    np.where(labels == 1, np.uint32(2), labels).tofile(path)
+
+
+def shorten(folder: Path, rng: np.random.Generator) -> None:
+    number = rng.integers(FRAMES)
+    for field, size in (("velodyne", 16), ("labels", 4), ("predictions", 12)):
+        (path,) = (scans(folder) / field).glob(f"{number:06d}.*")
+        path.write_bytes(path.read_bytes()[: 500 * size])
+
+
+def move_pose(folder: Path, rng: np.random.Generator) -> None:
+    path = scans(folder) / "poses.txt"
+    rows = np.loadtxt(path)
+    rows[rng.integers(1, FRAMES), 3] += 0.2
+    np.savetxt(path, rows)
+
+
+def delay(folder: Path, rng: np.random.Generator) -> None:
+    path = scans(folder) / "times.txt"
+    times = np.loadtxt(path)
+    times[rng.integers(1, FRAMES) :] += 0.02
+    np.savetxt(path, times)
+
+
+def remove(folder: Path, rng: np.random.Generator) -> None:
+    number = rng.integers(1, FRAMES - 1)
+    for field in ("velodyne", "labels", "predictions"):
+        (path,) = (scans(folder) / field).glob(f"{number:06d}.*")
+        path.unlink()
+
+
+def grow(folder: Path, rng: np.random.Generator) -> None:
+    longer = folder.with_name(f"{folder.name}-longer")
+    write_sequence(longer, frames=FRAMES + 3)
+    shutil.copytree(scans(longer), scans(folder), dirs_exist_ok=True)
+    shutil.rmtree(longer)
+
+
+CHANGES = [change_points, change_labels, shorten, move_pose, delay, remove, grow]
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("drive") / "data"
+    write_sequence(folder, frames=FRAMES)
+    return folder
+
+
+def copy(source: Path, target: Path) -> Path:
+    return Path(shutil.copytree(source, target))
+
+
+def compare(source: Path, out: Path, fresh: Path, observe, **options) -> tuple:
+    """Make grids again after a change, and compare them with those of a run into a new place."""
+    again = regrid(source, SPEC, out, observe=observe, run=ALONE, **options)
+    assert not again.failures
+    unchanged = regrid(source, SPEC, out, observe=observe, run=ALONE, **options)
+    assert unchanged.made == 0
+    assert not any("again" in note for note in unchanged.notes)
+    regrid(fresh, SPEC, fresh, observe=observe, run=ALONE, **options)
+    ours = outputs(source if out is None else Path(out))
+    assert ours == outputs(fresh)
+    return again
+
+
+@pytest.mark.parametrize("change", CHANGES, ids=lambda change: change.__name__)
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(i, marks=pytest.mark.slow) for i in range(1, 6))]
+)
+def test_a_changed_input_is_seen_and_what_depends_on_it_made_again(drive, tmp_path, change, seed):
+    source = copy(drive, tmp_path / "data")
+    regrid(source, SPEC, observe=STILL, run=ALONE)
+    change(source, np.random.default_rng(seed))
+    fresh = tmp_path / "fresh"
+    shutil.copytree(source, fresh, ignore=shutil.ignore_patterns("evaluation*", ".carlasc"))
+    again = compare(source, None, fresh, STILL)
+    assert 0 < again.made < FRAMES + 3
+    assert sum("made again" in note for note in again.notes) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("change", CHANGES, ids=lambda change: change.__name__)
+@pytest.mark.parametrize("seed", range(3))
+def test_tracks_and_refined_poses_are_found_again(drive, tmp_path, change, seed):
+    source = copy(drive, tmp_path / "data")
+    observe = FromScans(window=(-2, 2), poses=PoseOptions("file", "always"))
+    regrid(source, SPEC, observe=observe, run=ALONE)
+    change(source, np.random.default_rng(seed))
+    fresh = tmp_path / "fresh"
+    shutil.copytree(source, fresh, ignore=shutil.ignore_patterns("evaluation*", ".carlasc"))
+    compare(source, None, fresh, observe)
+
+
+@pytest.fixture
+def made(drive, tmp_path) -> Path:
+    """A drive with grids."""
+    source = copy(drive, tmp_path / "data")
+    regrid(source, SPEC, observe=STILL, run=ALONE)
+    return source
+
+
+def test_a_copy_with_other_times_is_not_stale(made, tmp_path):
+    other = Path(shutil.copytree(made, tmp_path / "other", copy_function=shutil.copyfile))
+    again = regrid(other, SPEC, observe=STILL, run=ALONE)
+    assert (again.made, again.notes) == (0, regrid(made, SPEC, observe=STILL, run=ALONE).notes)
+    assert not any(grid.stale for one in carlasc.info(other).sequences for grid in one.grids)
+
+
+def test_content_is_compared_if_asked(made):
+    path = scans(made) / "labels/000003.label"
+    about = path.stat()
+    np.full(about.st_size // 4, 2, np.uint32).tofile(path)
+    os.utime(path, ns=(about.st_atime_ns, about.st_mtime_ns))
+    options = {"observe": STILL, "run": ALONE}
+    assert regrid(made, SPEC, **options).made == 0
+    assert regrid(made, SPEC, compare_inputs="content", **options).made == 5
+
+
+def test_nothing_is_compared_if_asked(made):
+    change_points(made, np.random.default_rng(0))
+    assert regrid(made, SPEC, observe=STILL, compare_inputs="never", run=ALONE).made == 0
+    assert regrid(made, SPEC, observe=STILL, run=ALONE).made > 0
+
+
+def test_grids_without_a_record_are_compared_once(made):
+    records = scans(made) / ".carlasc"
+    shutil.rmtree(records)
+    first, second = (regrid(made, SPEC, observe=STILL, run=ALONE) for _ in range(2))
+    assert (first.made, second.made) == (0, 0)
+    assert ["equal" in note for note in first.notes if "without a record" in note] == [True]
+    assert not any("record" in note for note in second.notes)
+    shutil.rmtree(records)
+    for number in range(FRAMES):
+        (scans(made) / f"labels/{number:06d}.label").write_bytes(
+            np.full((scans(made) / f"labels/{number:06d}.label").stat().st_size // 4, 2, "<u4")
+        )
+    assert regrid(made, SPEC, observe=STILL, run=ALONE).made == FRAMES
+
+
+@pytest.mark.parametrize("change", [change_points, change_labels, move_pose, remove])
+def test_info_and_validate_name_grids_that_are_stale(made, change):
+    change(made, np.random.default_rng(0))
+    ((grid,),) = [one.grids for one in carlasc.info(made).sequences]
+    assert grid.stale.startswith("scan")
+    findings = [one for one in carlasc.validate(made).findings if one.check == "inputs"]
+    assert [one.found for one in findings] == [grid.stale]
+    regrid(made, SPEC, observe=STILL, run=ALONE)
+    assert not any(one.stale for one in carlasc.info(made).sequences[0].grids)
+
+
+def test_scans_beside_grids_elsewhere_are_replaced(drive, tmp_path):
+    source, out = copy(drive, tmp_path / "data"), tmp_path / "out"
+    regrid(source, SPEC, out, observe=STILL, run=ALONE)
+    change_labels(source, np.random.default_rng(0))
+    regrid(source, SPEC, out, observe=STILL, run=ALONE)
+    regrid(source, SPEC, tmp_path / "fresh", observe=STILL, run=ALONE)
+    assert outputs(out) == outputs(tmp_path / "fresh")
+
+
+def test_a_coarser_grid_follows_the_finer_one(made, tmp_path):
+    coarse, observe = SPEC.with_size((16, 16, 4)), FromGrid()
+    regrid(made, coarse, observe=observe, run=ALONE)
+    change_labels(made, np.random.default_rng(0))
+    regrid(made, SPEC, observe=STILL, run=ALONE)
+    again = regrid(made, coarse, observe=observe, run=ALONE)
+    assert 0 < again.made < FRAMES
+    fresh = tmp_path / "fresh"
+    shutil.copytree(made, fresh, ignore=shutil.ignore_patterns("evaluation_16*", ".carlasc"))
+    regrid(fresh, coarse, observe=observe, run=ALONE)
+    assert outputs(made) == outputs(fresh)
+
+
+@pytest.mark.parametrize("sensor", [0, 1])
+def test_a_changed_recording_of_a_capture(tmp_path, sensor):
+    write_capture(tmp_path / "data", frames=4)
+    regrid(tmp_path / "data", SPEC, tmp_path / "out", run=ALONE)
+    path = tmp_path / f"data/raw/labels{sensor}/102.npy"
+    np.save(path, np.full_like(np.load(path), 3))
+    again = regrid(tmp_path / "data", SPEC, tmp_path / "out", run=ALONE)
+    assert again.made == 1
+    regrid(tmp_path / "data", SPEC, tmp_path / "fresh", run=ALONE)
+    assert outputs(tmp_path / "out") == outputs(tmp_path / "fresh")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("ending", ["zarr", "h5", "parquet"])
+def test_grids_in_a_folder_of_scans_in_a_store(drive, tmp_path, ending, workers):
+    run = Run(workers)
+    source, changed = copy(drive, tmp_path / "data"), tmp_path / f"data.{ending}"
+    carlasc.pack(source, changed, run=ALONE)
+    regrid(changed, SPEC, tmp_path / "out", observe=STILL, run=run)
+    assert regrid(changed, SPEC, tmp_path / "out", observe=STILL, run=run).made == 0
+    change_points(source, np.random.default_rng(0))
+    carlasc.pack(source, changed, overwrite=True, run=ALONE)
+    again = regrid(changed, SPEC, tmp_path / "out", observe=STILL, run=run)
+    assert 0 < again.made < FRAMES
+    regrid(changed, SPEC, tmp_path / "fresh", observe=STILL, run=ALONE)
+    assert outputs(tmp_path / "out") == outputs(tmp_path / "fresh")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2])
+def test_grids_in_a_zarr_store(drive, tmp_path, workers):
+    source, run = copy(drive, tmp_path / "data"), Run(workers)
+    regrid(source, SPEC, tmp_path / "out.zarr", observe=STILL, run=run)
+    change_points(source, np.random.default_rng(0))
+    again = regrid(source, SPEC, tmp_path / "out.zarr", observe=STILL, run=run)
+    assert 0 < again.made < FRAMES
+    carlasc.unpack(tmp_path / "out.zarr", tmp_path / "out", run=ALONE)
+    regrid(source, SPEC, tmp_path / "fresh", observe=STILL, run=ALONE)
+    assert outputs(tmp_path / "out") == outputs(tmp_path / "fresh")
+
+
+@pytest.mark.slow
+def test_parts_make_what_changed_again(drive, tmp_path):
+    source, out = copy(drive, tmp_path / "data"), tmp_path / "out"
+    parts = [Run(1, part=Part(number, 2)) for number in (1, 2)]
+    for part in parts:
+        regrid(source, SPEC, out, observe=STILL, run=part)
+    change_points(source, np.random.default_rng(0))
+    again = [regrid(source, SPEC, out, observe=STILL, run=part) for part in parts]
+    assert 0 < sum(one.made for one in again) < FRAMES
+    regrid(source, SPEC, tmp_path / "fresh", observe=STILL, run=ALONE)
+    assert outputs(out) == outputs(tmp_path / "fresh")
