@@ -97,7 +97,7 @@ def each_voter(observations):
             one,
             points=one.points[a:b],
             labels=one.labels[a:b],
-            hits=one.hits[a:b],
+            hits=None if one.hits is None else one.hits[a:b],
             grid_T_sensor=pose,
             ends=None,
         )
@@ -282,7 +282,7 @@ def test_the_mirror_image_of_an_actor_has_its_points_on_the_other_side():
 
 def test_what_passes_is_where_it_was_seen_and_frees_nothing():
     now = instant(15)
-    passing = list(merger().moving(now, [frame for frame in FRAMES if frame != 15]))
+    passing = each_voter(merger().moving(now, [frame for frame in FRAMES if frame != 15]))
     assert len(passing) == 30
     for frame, one in zip([f for f in FRAMES if f != 15], passing, strict=True):
         assert not one.rays and one.labels.tolist() == [VEHICLE]

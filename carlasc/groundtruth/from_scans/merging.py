@@ -345,17 +345,24 @@ class Merger:
         return found
 
     def moving(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
-        """Yield the moving points of each scan, at their positions in that scan."""
+        """Yield the moving points of scans, at their positions in these scans."""
+        seen = list[tuple[Float32Array, Uint16Array, Transform]]()
         for other in window:
             scan = self.scan_of(other)
             if other not in self._moving:
                 moving = np.flatnonzero(~self.static(other))
                 self._moving[other] = scan.points[moving], self.labels(other)[moving]
-            points, labels = self._moving[other]
-            if len(points):
-                yield Observation(
-                    points, labels, now.grid_T_world @ scan.world_T_sensor, rays=False
-                )
+            seen.append((*self._moving[other], now.grid_T_world @ scan.world_T_sensor))
+        if seen:
+            points, labels, poses = zip(*seen, strict=True)
+            ends = np.cumsum([len(own) for own in points])
+            yield Observation(
+                np.concatenate(points),
+                np.concatenate(labels),
+                np.stack(poses),
+                ends=ends,
+                rays=False,
+            )
 
     def recent(self, now: Instant, window: Iterable[int]) -> list[int]:
         """Return the frames of the scans within `_RECENT_S` of the frame."""
