@@ -82,6 +82,7 @@ def test_a_frame_from_merged_scans(
     frame = int(feed.frames[len(feed.frames) // 2])
 
     def make() -> tuple[FrameData, Any]:
+        feed._free = None  # a frame alone: all rays are followed
         merged = merge_frame(plan, feed, MovingActors(), frame, feed.window_of(frame))
         assert merged.votes is not None
         return merged, merged.votes.to_sparse()
