@@ -113,6 +113,32 @@ def test_a_region_does_not_change_what_is_in_it():
     assert np.array_equal(whole[inside], part[inside]) and whole[inside].all()
 
 
+def test_scans_that_reach_no_grid_and_scans_without_points_leave_the_others():
+    rays = cast(0)
+    away = rays._replace(lower=np.full(3, 40.0), upper=np.full(3, -40.0))
+    empty = cast(1)._replace(points=np.empty((0, 3), np.float32), ends=np.array([0]))
+    casts = [away, rays, empty, away]
+    found = held(casts)
+    assert np.array_equal(found.count(np.eye(4)), held([rays]).count(np.eye(4)))
+    found.hold([0, 2, 3], casts.__getitem__)
+    assert not found.count(np.eye(4)).any()
+
+
+def test_memory_that_runs_out_leaves_no_half_scan(monkeypatch):
+    casts = [cast(0), cast(1, 4000)]
+    found = held(casts, [0])
+
+    def full(self):
+        raise MemoryError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FreeMap, "_grow", full)
+        with pytest.raises(MemoryError):
+            found.hold([0, 1], casts.__getitem__)
+    found.hold([0], casts.__getitem__)
+    assert np.array_equal(found.count(np.eye(4)), held(casts, [0]).count(np.eye(4)))
+
+
 def test_memory_does_not_grow_along_a_drive():
     found, sizes = FreeMap(SPEC, STEP_M), []
 

@@ -126,8 +126,13 @@ class FreeMap:
                 upper = (
                     np.floor((cast.upper + self._margin_m) / self._cell).astype(np.int64) >> _BITS
                 ) + 1
-                self._make_room(lower, upper)
-                self._trace(cast, lower, upper, 1)
+                upper = np.maximum(upper, lower)  # a region may be empty
+                try:
+                    self._make_room(lower, upper)
+                    self._trace(cast, lower, upper, 1)
+                except BaseException:  # half a scan must not stay
+                    self._clear()
+                    raise
                 self._held[scan] = cast, lower, upper
 
     def _trace(self, cast: Cast, lower: IntArray, upper: IntArray, sign: int) -> None:
