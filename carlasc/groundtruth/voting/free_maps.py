@@ -151,12 +151,15 @@ class FreeMap:
 
     def _grow(self) -> None:
         """Make room for more blocks."""
-        # The memory of new blocks is not used before rays pass through them.
         old, size = self._blocks, len(self._blocks.counts)
         left, more = int(old.left[0]), max(size // 4, _FEWEST)
-        new = np.zeros((more, _EDGE**3), np.int32)
-        counts = np.concatenate([old.counts, new])
-        stamps = np.concatenate([old.stamps, new]) if self.views else old.stamps
+        # zeros take no memory before rays pass through a block
+        counts = np.zeros((size + more, _EDGE**3), np.int32)
+        counts[:size] = old.counts
+        stamps = old.stamps
+        if self.views:
+            stamps = np.zeros_like(counts)
+            stamps[:size] = old.stamps
         # the last ones are taken first: memory that was used before
         unused = np.concatenate([np.arange(size + more - 1, size - 1, -1), old.unused[:left]])
         unused = np.concatenate([unused, np.zeros(size - left, np.int64)]).astype(np.int32)
