@@ -46,7 +46,7 @@ lint: $(VENV)/ready ## ruff
 
 types: $(VENV)/ready ## mypy
 	$(RUN)/mypy
-	cd examples && MYPYPATH=. ../$(RUN)/mypy --cache-dir ../.mypy_cache --config-file ../pyproject.toml .
+	cd examples && MYPYPATH=.:mixture ../$(RUN)/mypy --cache-dir ../.mypy_cache --config-file ../pyproject.toml .
 	cd docs/studies && MYPYPATH=.:../../converters:../../tests ../../$(RUN)/mypy --cache-dir ../../.mypy_cache --config-file ../../pyproject.toml .
 
 unit: $(VENV)/ready ## the quick tests

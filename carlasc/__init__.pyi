@@ -29,6 +29,7 @@ from .dataset import Dataset as Dataset
 from .dataset import Flip as Flip
 from .dataset import ShardSampler as ShardSampler
 from .dataset import collate as collate
+from .dataset import collate_sparse as collate_sparse
 from .groundtruth import FromCapture as FromCapture
 from .groundtruth import FromGrid as FromGrid
 from .groundtruth import FromScans as FromScans

@@ -17,6 +17,7 @@ import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
+from itertools import groupby
 from numbers import Integral, Real
 from types import FrameType, ModuleType, UnionType
 from typing import Any, Self, Union, get_args, get_origin, get_type_hints
@@ -190,6 +191,13 @@ class ConflictError(CarlascError):
     """Writing would destroy existing data, or mix with them."""
 
 
+class CompleteError(ConflictError):
+    """The output exists, whole, and was made with the same options from the same input.
+
+    Commands say so and exit with 0.
+    """
+
+
 class StorageError(CarlascError):
     """The output cannot be written: a full disk, a folder without write permission.
 
@@ -239,18 +247,18 @@ def check_types(function: Callable[..., object], arguments: Mapping[str, object]
     """
     for name, kinds in _kinds_of(function).items():
         value = arguments[name]
-        if not any(_is_a(value, kind) for kind in kinds):
+        if not _is_one_of(value, kinds):
             shown = [kind for kind in kinds if kind is not str or os.PathLike not in kinds]
             names = (_KIND_NAMES.get(kind, f"a {kind.__name__}") for kind in shown)
             raise ArgumentError(name, expected=" or ".join(dict.fromkeys(names)), found=repr(value))
 
 
-def _is_a(value: object, kind: type) -> bool:
-    if isinstance(value, str) and kind is not str:
-        return False  # a text is not meant as a sequence of its letters
-    if isinstance(value, bool) and kind in (Integral, Real):
-        return False
-    return isinstance(value, kind)
+def _is_one_of(value: object, kinds: list[type]) -> bool:
+    if isinstance(value, str):
+        return str in kinds  # a text is not meant as a sequence of its letters
+    if isinstance(value, bool):
+        kinds = [kind for kind in kinds if kind not in (Integral, Real)]
+    return isinstance(value, tuple(kinds))
 
 
 @cache
@@ -360,6 +368,19 @@ def first_names(names: Iterable[str], most: int = 8) -> str:
     """Return the first `most` names, separated by commas, and the number of further names."""
     names = list(names)
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def runs_of(numbers: Iterable[int]) -> list[tuple[int, int]]:
+    """Return the first and the last number of each run of successive numbers."""
+    by_run = groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])
+    runs = [[number for _, number in run] for _, run in by_run]
+    return [(run[0], run[-1]) for run in runs]
+
+
+def first_runs(numbers: Iterable[int], most: int = 8) -> str:
+    """Return increasing numbers as ranges: "0 to 3, 7 and 2 more"."""
+    texts = (f"{a}" if a == b else f"{a} to {b}" for a, b in runs_of(numbers))
+    return first_names(texts, most)
 
 
 def plugin_names(group: str) -> tuple[str, ...]:

@@ -141,7 +141,8 @@ def play(page, folder, programs):
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
     )
-    progress = rf"(?:^|(?<={END}))[^{END}\n]+: \d+ of \d+ [\w ]+, \d+ s\n"  # on slow machines
+    # on slow machines; after "...", it is in the line of a step
+    progress = rf"(?:^|(?<={END})|(?<=\.\.\.))[^{END}\n.]+: \d+ of \d+ [\w ]+, \d+ s\n"
     printed = re.sub(progress, "", ran.stdout, flags=re.MULTILINE)
     outputs = [
         re.fullmatch(r"(.*?)(\d+)", output, re.DOTALL).groups()

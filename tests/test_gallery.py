@@ -29,7 +29,7 @@ def test_the_page_shows_what_its_commands_draw_and_nothing_else(gallery):
     ]
     assert [words[words.index("-o") + 1] for words in drawn] == shown
     assert sorted(shown) == sorted(path.name for path in gallery.IMAGES.iterdir())
-    assert len([name for name in shown if name.endswith(".png")]) == 15
+    assert len([name for name in shown if name.endswith(".png")]) == 26
     assert len([name for name in shown if name.endswith(".webp")]) == 2
 
 

@@ -29,6 +29,7 @@ from carlasc.storage import layout
 from carlasc.storage.arrays import ArrayFormat, parse_npy
 from carlasc.storage.camera_files import cameras_from_json
 from carlasc.storage.files import AnyPath
+from carlasc.storage.inputs import FrameFiles, digest_of_bytes
 from carlasc.storage.transport.remote_tree import RemoteTree, tree_of
 from carlasc.storage.transport.trees import LocalTree, Tree
 
@@ -157,6 +158,13 @@ class Capture:
         self._folder = f"{RAW}/" if self.tree.entries().get(RAW) else ""
         self.location = self.tree.where(self._folder.rstrip("/"))
         self.classes = classes
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether `carlasc simulate` or `carlasc capture` recorded it, whose settings are beside
+        it.
+        """
+        return not {"simulation.json", "recording.json"}.isdisjoint(self._entries(""))
 
     @cached_property
     def sensors(self) -> tuple[int, ...]:
@@ -435,3 +443,22 @@ def _check_folder(tree: Tree) -> None:
         raise MissingDataError(tree.location, expected="a folder", found="a file")
     elif not tree.entries():
         raise MissingDataError(tree.location, expected="a folder", found="nothing")
+
+
+class CaptureFiles(FrameFiles):
+    """The files of each frame of a capture."""
+
+    kind = "capture"
+
+    def __init__(self, capture: Capture) -> None:
+        self.capture, self.tree = capture, capture.tree
+
+    def paths(self, frame: int) -> list[str]:
+        """Return the files of all sensors and cameras."""
+        return self.capture.files_of(frame)
+
+    def contents(self, frame: int) -> Iterator[tuple[str, bytes]]:
+        """Yield the name and the digest of each file."""
+        paths = self.paths(frame)
+        for path, data in zip(paths, self.capture.tree.read_many(paths), strict=True):
+            yield path, digest_of_bytes(data)

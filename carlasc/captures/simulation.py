@@ -60,6 +60,8 @@ class Simulator(Capture, ABC):
     frames must not be mixed in one capture.
     """
 
+    is_simulated = True
+
     def __init__(
         self,
         *,

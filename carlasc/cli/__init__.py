@@ -5,16 +5,19 @@ prints its result.
 from __future__ import annotations
 
 import importlib
+import os
+import signal
 import sys
 from collections import UserDict
 from collections.abc import Sequence
+from contextlib import suppress
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
 from carlasc.cli.commands import Command, CommandGroup
-from carlasc.cli.common import echo
+from carlasc.cli.common import INTERRUPTED, echo
 from carlasc.cli.flags import declared_by, flatten
 from carlasc.core.first_use import note_compiling, say_compiling
 
@@ -165,4 +168,12 @@ def main() -> None:
     """Run the command line: the entry point `carlasc`."""
     if sys.stderr is not None and sys.stderr.isatty():  # on terminals only, like progress bars
         note_compiling(say_compiling)
-    app()
+    try:
+        app()
+    except KeyboardInterrupt:  # after the command caught its own
+        sys.exit(INTERRUPTED)
+    finally:
+        # the result is printed: Ctrl-C ends what Python does before it exits
+        with suppress(OSError, ValueError):
+            sys.stdout.flush()
+        signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))

@@ -25,7 +25,7 @@ from carlasc.cli.common import (
     fail,
 )
 from carlasc.cli.library import SEPARATOR
-from carlasc.errors import ArgumentError, CarlascError
+from carlasc.errors import ArgumentError, CarlascError, CompleteError
 
 _INTERRUPTED = (
     "interrupted: files written so far are complete; run the same command again to continue"
@@ -144,6 +144,8 @@ def _errors_in_one_line(command: Any) -> Iterator[None]:
         path = f"carlasc {command.name}" if error.ctx is None else error.ctx.command_path
         text = " ".join(error.format_message().replace(": Value error, ", ": ").split()).rstrip(".")
         fail(f"{text[:1].lower()}{text[1:]}: see `{path} --help`", WRONG_USAGE)
+    except CompleteError as error:
+        echo(as_typed(str(error)))
     except CarlascError as error:
         shown = copy.copy(error)
         if isinstance(error, ArgumentError):

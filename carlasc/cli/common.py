@@ -151,7 +151,9 @@ class BatchError(Exception):
         self.messages = messages
 
 
-def report_failures(failures: Sequence[tuple[Any, str]], total: int, what: str = "frames") -> None:
+def report_failures(
+    failures: Sequence[tuple[Any, str]], total: int, what: str = "frames", waiting: int = 0
+) -> None:
     """End the command with exit code 1, and with what failed on stderr, if anything in a batch
     failed.
 
@@ -159,11 +161,13 @@ def report_failures(failures: Sequence[tuple[Any, str]], total: int, what: str =
         failures: (what failed, message) of each.
         total: number of things that were tried.
         what: what these are, in the plural.
+        waiting: how many of the failures only wait for another one.
     """
     if failures:
+        wait = f", and {waiting} wait for them" if waiting else ""
         summary = (
-            f"{len(failures)} of {total} {what} failed; the others are done: fix these and run the "
-            "command again"
+            f"{len(failures) - waiting} of {total} {what} failed{wait}; the others are done: fix "
+            "these and run the command again"
         )
         raise BatchError(summary, [message for _, message in failures])
 
@@ -209,6 +213,8 @@ def print_frames(result: Any, places: Iterable[object], done: str, *, json: bool
             echo(as_typed(f"note: {note}"))
         for place in places:
             echo(place)
+        if uses := getattr(result, "source_classes", ()):
+            echo(f"classes: {', '.join(map(str, uses))}")
         what, _, verb = done.rpartition(": ")
         skipped = f" ({result.skipped} existed)" if result.skipped else ""
         echo(
@@ -216,7 +222,8 @@ def print_frames(result: Any, places: Iterable[object], done: str, *, json: bool
             f"{result.elapsed_s:.1f} s"
         )
     failures = [(failure.frame, failure.message) for failure in result.failures]
-    report_failures(failures, result.made + result.skipped + len(failures))
+    waiting = sum(getattr(failure, "waits", False) for failure in result.failures)
+    report_failures(failures, result.made + result.skipped + len(failures), waiting=waiting)
 
 
 @contextmanager

@@ -54,8 +54,8 @@ def _print_preview(
             else f"height of the sensor above the ground: {one.height_m:g} m"
         )
         echo(f"  {ground}")
-        estimated = "estimated from the scans with KISS-ICP"
-        echo(f"  poses: {'those of the recording' if one.poses == 'file' else estimated}")
+        known = one.poses == "file"
+        echo(f"  poses: {'those of the recording' if known else 'estimated from the scans'}")
         for note in one.notes:
             echo(f"  {as_typed(note)}")
         print_warnings(one.findings)
@@ -159,7 +159,7 @@ def convert(
         making.votes.make(),
         follow_ground=not bounded,
     )
-    with run.spread(f"convert {name}") as spread:
+    with run.spread(f"convert {name}", "steps") as spread:
         result = written.make(
             name,
             source,

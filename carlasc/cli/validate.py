@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from carlasc.inspection.heldout_scores import HeldOutScores, RayShares
 
 _SHOWN = 3
+_SAMPLE = 20  # frames of each grid that are made again with --full
 _COLORS = {"error": "red", "warning": "yellow", "note": "cyan"}
 
 
@@ -51,7 +52,7 @@ class HoldoutFlags(Flags):
 
 @dataclass(frozen=True)
 class HoldoutGridFlags(GridFlags):
-    """The grid whose free voxels are tested."""
+    """The grid whose voxels are tested: the one that exists if none is given."""
 
     heading: ClassVar[str] = HoldoutFlags.heading
 
@@ -60,7 +61,14 @@ def validate(
     *,
     source: SourceArgument = ".",
     options: Annotated[Given, Library("carlasc.validate")],
-    full: Annotated[bool, typer.Option("--full", help="Read the contents of all frames.")] = False,
+    full: Annotated[
+        bool,
+        typer.Option(
+            "--full",
+            help="Read the contents of all frames, and make 20 frames of each grid again, or "
+            "--sample of them.",
+        ),
+    ] = False,
     everything: Annotated[
         bool,
         typer.Option("--all", help="Print all findings, not only the first three of each kind."),
@@ -74,13 +82,13 @@ def validate(
 ) -> None:
     """Check a data set: files, poses, times, and whether scans agree with poses and grids.
 
-    The exit code is 1 if there is an error.
+    The exit code is 0 if the data are sound, and 1 otherwise.
 
     It finds files of the wrong size, labels without votes, unknown classes, poses that are not
     rigid or jump, and gaps. By comparing scans with poses and grids, it recognizes a mirrored y
     axis, poses of a camera, transposed rotations, and a grid shifted by one voxel.
     """
-    if full and options.is_given:
+    if full and "every" in options.values:
         raise ArgumentError(
             "every", expected="only one of --every and --full", found="both", advice="leave one out"
         )
@@ -93,11 +101,14 @@ def validate(
             found="none",
             advice="give `holdout`",
         )
-    spec = grid.spec_or_published()
-    observe = scans.make(motion=motion.make(), poses=carlasc.motion.PoseOptions("file"))
+    spec = grid.spec_or_published() if grid.is_given else None
+    observe = None
+    if scans.is_given or motion.is_given:
+        observe = scans.make(motion=motion.make(), poses=carlasc.motion.PoseOptions("file"))
     rays = None
     with work.spread("Validating", "steps", usual=1) as run:
-        result = options.make(source, **({"every": 1} if full else {}), run=run)
+        more = {"every": 1, "sample": options.values.get("sample", _SAMPLE)} if full else {}
+        result = options.make(source, **more, run=run)
     if holdout.holdout:
         left_out = holdout.holdout_every or carlasc.inspection.EVERY
         with work.spread("Leaving scans out") as run:
@@ -115,13 +126,13 @@ def validate(
         report_failures(
             [(failure.frame, failure.message) for failure in rays.failures], measured, "scans"
         )
-    if not result.ok:
+    if not result.ok or (rays is not None and rays.state != "right"):
         raise typer.Exit(FAILED)
 
 
 def print_result(result: ValidationResult, *, everything: bool = False) -> None:
     """Print the findings by kind, errors first; `carlasc demo` uses it too."""
-    from carlasc.inspection.findings import SEVERITIES
+    from carlasc.inspection.findings import SEVERITIES, STATES
 
     for (severity, check), findings in result.grouped().items():
         show(f"{severity}: {check} ({len(findings)})", _COLORS[severity])
@@ -153,14 +164,19 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
             show(f"  sensor in the frame of the poses: {mounting}")
         for camera, agreement in report.images.items():
             show(f"  images of {camera} on the scans: {agreement}")
+        for state, words in STATES.items():
+            if own := [check for check, of_check in report.checks.items() if of_check == state]:
+                show(f"  {words}: {', '.join(own)}")
     counts = ", ".join(count(result.count(severity), severity) for severity in SEVERITIES)
-    show(f"{result.location}: {'sound' if result.ok else 'not sound'} ({counts})", "bold")
+    show(f"{result.location}: {result.verdict} ({counts})", "bold")
 
 
 def print_held_out(result: HoldoutResult) -> None:
     """Print the scores of the held-out rays: of all sequences together, or of each if their classes
     differ.
     """
+    from carlasc.inspection.findings import STATES
+
     total = result.total
     parts = result.sequences if total is None else {result.location: total}
     for name, scores in parts.items():
@@ -173,7 +189,14 @@ def print_held_out(result: HoldoutResult) -> None:
         shares = scores.all
         figures = {"free": shares.free, "unknown": shares.unknown, "occupied": shares.occupied}
         text = ", ".join(f"{100 * (share or 0):.2f} % {where}" for where, share in figures.items())
-        show(f"{name or result.location}: under the given poses: returns in {text} voxels")
+        show(
+            f"{name or result.location}: under the given poses: returns in {text} voxels; "
+            f"{100 * (shares.passed_object or 0):.2f} % of the rays pass through objects"
+        )
+    for name, fault in result.faults.items():
+        if fault:
+            show(f"{name or result.location}: {fault}", "yellow")
+    show(f"{result.location}: held-out rays: {STATES[result.state]}", "bold")
 
 
 def _print_scores(title: str, scores: HeldOutScores) -> None:

@@ -20,10 +20,10 @@ from carlasc.converting.protocol import (
     Trajectory,
 )
 from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, LabelArray, Uint32Array
-from carlasc.core.choices import Axes
+from carlasc.core.choices import Axes, CompareInputs
 from carlasc.core.choices import FlowSource as FlowSource  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import Images as Images  # noqa: PLC0414 (part of this module)
-from carlasc.core.classes import ClassTable, Remap
+from carlasc.core.classes import ClassTable, Remap, ids_in
 from carlasc.core.geometry import Transform, invert, mirror_points, transform_points
 from carlasc.errors import (
     ArgumentError,
@@ -59,9 +59,14 @@ class LayoutOptions:
             written. "none": left out. The calibration of the cameras is always written.
         level: turn scans upright, so that the ground in them is level: for a LiDAR that is mounted
             upside down or at an angle, without a calibration that says so.
+        allow_gaps: finish frames that take labels, motion or votes from a frame that failed.
+            Otherwise they wait until it is repaired.
+        compare_inputs: how it is found out whether the data set changed since an earlier run:
+            "fast": by the names, sizes and times of its files; "content": all frames are made
+            again and compared; "never": existing frames are kept.
 
     Raises:
-        ArgumentError: an unknown value of `axes`, `flow` or `images`.
+        ArgumentError: an unknown value of `axes`, `flow`, `images` or `compare_inputs`.
     """
 
     classes: str = "auto"
@@ -70,12 +75,15 @@ class LayoutOptions:
     allow_unknown: bool = False
     images: Images = "none"
     level: bool = False
+    allow_gaps: bool = False
+    compare_inputs: CompareInputs = "fast"
 
     def __post_init__(self) -> None:
         check_types(LayoutOptions, vars(self))
         check_choice("axes", self.axes, Axes)
         check_choice("images", self.images, Images)
         check_choice("flow", self.flow, FlowSource)
+        check_choice("compare_inputs", self.compare_inputs, CompareInputs)
 
     def of(self, converter: Converter) -> AxesAndClasses:
         """Return the axes and the classes in which the data of a converter are written.
@@ -136,7 +144,7 @@ class AxesAndClasses:
         if mapped.size and int(mapped.max()) == _UNKNOWN:
             unknown = mapped == _UNKNOWN
             if not self.allow_unknown:
-                counts = zip(*np.unique(labels[unknown], return_counts=True), strict=True)
+                counts = ids_in(labels[unknown]).items()
                 raise FormatError(
                     where,
                     expected=f"class ids of {self.source.name}",
@@ -341,7 +349,9 @@ def _place(
     else:
         points = cloud.points.copy()
         points[:, :3] = move_each(cloud.points, scan_T_then, tick_of)
-    if cloud.origins is not None:
+    if cloud.origins is not None and not sensor.deskewed:
+        origins = move_each(cloud.origins, scan_T_then, tick_of).astype(np.float32)
+    elif cloud.origins is not None:
         origins = transform_points(scan_T_points, cloud.origins).astype(np.float32)
     else:
         origins = _thinned(

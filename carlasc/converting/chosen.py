@@ -58,7 +58,8 @@ class ChosenFrames(Recording):
         found = self._own.poses(force=force)
         if found is None or self._turn is None:
             return found
-        return replace(found, world_T_vehicle=found.world_T_vehicle @ invert(self._turn))
+        turned = found.world_T_vehicle @ invert(self._turn)
+        return replace(found, world_T_vehicle=turned, other=None)
 
     def times(self) -> FloatArray | None:
         """Return the times of all frames."""

@@ -23,6 +23,7 @@ from carlasc.converting.protocol import Failure, check_outside
 from carlasc.converting.registry import load_exporter, read_options
 from carlasc.core.arrays import AnyArray
 from carlasc.core.choices import CompareInputs
+from carlasc.core.classes import TableUse
 from carlasc.errors import (
     CarlascError,
     ConflictError,
@@ -49,6 +50,7 @@ from carlasc.storage.files import (
 )
 from carlasc.storage.folder import FolderWriter
 from carlasc.storage.inputs import (
+    UNKNOWN,
     MadeFrom,
     SequenceFiles,
     combined,
@@ -83,6 +85,7 @@ class ExportResult:
     failures: tuple[Failure, ...]
     notes: tuple[str, ...]
     elapsed_s: float
+    source_classes: tuple[TableUse, ...] = ()
 
 
 def export(
@@ -163,18 +166,21 @@ def export(
         for exported in ours:
             label = f"export-{name}-{exporter.product}/{_place(exporter, exported)}"
             inputs = _ExportedFrom(exporter, root, label, exported, compare_inputs, pooled)
-            again = inputs.changed and any(
+            exists = any(
                 _exists(exporter, exported.sequence, frame, root / exported.folder)
                 for frame in exported.frames
             )
-            if again:
+            if inputs.changed and exists:
                 notes.append(f"{root / exported.folder}: {inputs.why(exported)}")
                 inputs.remove_gone()
-            else:
+            elif inputs.is_known or not exists:
                 inputs.write()
+            elif not overwrite and compare_inputs != "never":
+                notes.append(f"{root / exported.folder}: {UNKNOWN}")
             failed = len(writing.failures)
-            writing.add(exported, again=again)
-            if len(writing.failures) == failed:  # otherwise, frames of before may still be there
+            writing.add(exported, again=inputs.changed)
+            # otherwise, frames of before may still be there
+            if len(writing.failures) == failed and (inputs.is_known or overwrite):
                 inputs.write()
     if run.part.count == 1 or all(
         _is_whole(exporter, exported, root / exported.folder) for exported in chosen
@@ -190,6 +196,7 @@ def export(
         tuple(writing.failures),
         tuple(dict.fromkeys(notes)),
         time.perf_counter() - start,
+        tuple(sorted({exported.sequence.table_use() for exported in chosen})),
     )
 
 
@@ -279,11 +286,33 @@ def _exists(exporter: Exporter, sequence: storage.Sequence, frame: int, folder: 
     return all(has_content(folder / file) for file in files)
 
 
+_TEXTS = "-1"  # in the place of a frame: files that belong to no single frame
+
+
+class _RootFiles(FolderWriter):
+    """Keeps records as files in the folder of another data set: a reader of that data set could
+    take a folder for one of its own.
+    """
+
+    def read_document(self, name: str) -> bytes | None:
+        """Return the bytes of a record."""
+        return super().read_document(_flat(name))
+
+    def write_document(self, name: str, data: bytes) -> None:
+        """Write a record."""
+        super().write_document(_flat(name), data)
+
+
+def _flat(name: str) -> str:
+    return "carlasc-" + name.removeprefix(f"{layout.DERIVED}/").replace("/", "-")
+
+
 class _ExportedFrom:
     """The record of what a sequence was exported from. A frame may depend on all of the sequence.
 
     Attributes:
-        changed: whether the sequence is not known to be what it was.
+        is_known: whether there is a record.
+        changed: whether the sequence is not what the record says.
     """
 
     def __init__(
@@ -296,11 +325,10 @@ class _ExportedFrom:
         run: Run,
     ) -> None:
         self._exporter, self._sequence = exporter, exported.sequence
-        self._folder, self._writer = root / exported.folder, FolderWriter(root)
+        self._folder, self._writer = root / exported.folder, _RootFiles(root)
         self._label = f"{label}-{run.part.number}-of-{run.part.count}"
-        self._before = MadeFrom.read(self._writer, self._label)
-        self._now: MadeFrom | None = None
-        self.changed = False
+        self._before = self._now = MadeFrom.read(self._writer, self._label)
+        self.is_known, self.changed = bool(self._before.whole), False
         if compare != "never":
             sequence = self._sequence
             files = SequenceFiles(sequence, *sequence.fields())
@@ -314,14 +342,14 @@ class _ExportedFrom:
             ]
             whole = combined(sorted(own.items()), texts)
             written = {str(frame): self._files(frame) for frame in exported.frames}
+            written[_TEXTS] = "\n".join(exporter.documents(sequence))
             self._now = MadeFrom(whole, own, written)
-            self.changed = self._before.whole != whole
+            self.changed = self.is_known and self._before.whole != whole
 
     def why(self, exported: Exported) -> str:
         """Return why the sequence is exported again."""
-        own = {} if self._now is None else self._now.own
-        why = describe_changes(self._before.own, own) or "texts or settings changed"
-        return made_again(exported.frames, why if self._before.whole else "there was no record")
+        why = describe_changes(self._before.own, self._now.own) or "its text files changed"
+        return made_again(exported.frames, why)
 
     def _files(self, frame: int) -> str:
         """Return the files of a frame, separated by line breaks."""
@@ -330,17 +358,22 @@ class _ExportedFrom:
         return ""
 
     def remove_gone(self) -> None:
-        """Remove the files of frames that the sequence has no longer."""
-        left = set(self._exporter.frames(self._sequence))
-        for frame, files in self._before.frames.items():
-            if int(frame) not in left:
-                for file in files.splitlines():
-                    (self._folder / file).unlink(missing_ok=True)
+        """Remove the files that the export has no longer, in its own folder: a record of a stranger
+        may name any file.
+        """
+        inside = self._folder.resolve()
+        kept = set(self._now.frames[_TEXTS].splitlines())
+        for frame in self._exporter.frames(self._sequence):
+            kept.update(self._files(frame).splitlines())
+        for files in self._before.frames.values():
+            for file in set(files.splitlines()) - kept:
+                path = inside / file
+                if path.is_file() and path.parent.resolve().is_relative_to(inside):
+                    path.unlink()
 
     def write(self) -> None:
         """Write the record."""
-        if self._now is not None:
-            self._now.write(self._writer, self._label)
+        self._now.write(self._writer, self._label)
 
 
 @dataclass(frozen=True)

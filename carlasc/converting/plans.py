@@ -13,31 +13,38 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from carlasc.converting.assembling import AxesAndClasses, Rig, VehicleMotion, read_scan
+from carlasc.converting.assembling import (
+    AxesAndClasses,
+    LayoutOptions,
+    Rig,
+    VehicleMotion,
+    read_scan,
+)
 from carlasc.converting.chosen import ChosenFrames
 from carlasc.converting.plausibility import (
     POSE_S,
     Mount,
-    ScanCentres,
     are_posed,
     check_mount,
     check_scan,
+    check_standing,
     find_mount,
 )
 from carlasc.converting.protocol import Converter, FrameHandle, Recording, Trajectory
-from carlasc.core.arrays import Float32Array, FloatArray, IntArray
+from carlasc.core.arrays import Float32Array, FloatArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.choices import SplitName as SplitName  # noqa: PLC0414 (part of this module)
 from carlasc.core.frames import FrameRange, check_seconds
 from carlasc.core.geometry import invert, mirror_poses, relative_to
 from carlasc.core.grids import GridSpec, mirror_spec
+from carlasc.core.scans import ScanCentres
 from carlasc.errors import (
     ArgumentError,
     CarlascError,
     ConflictError,
     FormatError,
     MissingDataError,
-    first_names,
+    first_runs,
 )
 from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses, structure_of
 from carlasc.inspection.findings import Finding
@@ -65,23 +72,44 @@ _AROUND_S = 1.0  # part of the trajectory that a frame needs: longer than a swee
 
 
 @dataclass
-class RecordingPlan:
+class Examined:
+    """What is known of a recording before it is converted.
+
+    Attributes:
+        recording: the recording, with the frames that are converted, and upright.
+        times: (F,) seconds by frame number, by the recording's clock.
+        has_times: whether the recording has times.
+        trajectory: poses of the vehicle by the same clock; None until they are estimated.
+        poses: (F, 4, 4) first_T_scan by frame number, right-handed; None until they are estimated.
+        mount: how the sensor is mounted; None if no ground was found, or not looked for.
+        notes: notes for the user on poses and times, one line each.
+        findings: what is probably wrong ("warning"), and what stops a conversion ("error").
+    """
+
+    recording: Recording
+    times: FloatArray
+    has_times: bool
+    trajectory: Trajectory | None
+    poses: FloatArray | None
+    mount: Mount | None
+    notes: list[str]
+    findings: list[Finding]
+
+
+@dataclass
+class RecordingPlan(Examined):
     """One recording and its output.
 
     Attributes:
-        recording: the recording.
         writer: the output.
-        times: (F,) seconds by frame number, by the recording's clock.
-        trajectory: poses of the vehicle by the same clock; None until they are estimated.
-        poses: (F, 4, 4) first_T_scan by frame number, right-handed; None until they are estimated.
         pose_source: where poses come from.
         boxes: the annotated boxes by frame number, with class ids of the data set, right-handed, in
             the frame of the scan; None if the data set has no boxes.
         flow: whether flow is written.
         voxels: geometry of the recording's own voxel grids, right-handed, if they are written.
-        notes: notes for the user on poses and times, one line each.
-        findings: what is probably wrong.
-        force: whether estimated poses are not checked.
+        force: whether estimated poses are accepted without a check.
+        voxel_m: size of the voxels of the odometry; None: by the distances of points.
+        max_range_m: farther points are not used by the odometry; None: as the converter says.
         missing: numbers of the frames whose scan is not written yet.
         unfinished: numbers of the frames without a scan, or without the fields from the motion of
             actors.
@@ -89,18 +117,14 @@ class RecordingPlan:
             data set changed.
     """
 
-    recording: Recording
     writer: SequenceWriter
-    times: FloatArray
-    trajectory: Trajectory | None
-    poses: FloatArray | None
     pose_source: str
     boxes: dict[int, Boxes] | None
     flow: bool
     voxels: GridSpec | None = None
-    notes: list[str] = field(default_factory=list)
-    findings: list[Finding] = field(default_factory=list)
     force: bool = False
+    voxel_m: float | None = None
+    max_range_m: float | None = None
     missing: set[int] = field(default_factory=set)
     unfinished: set[int] = field(default_factory=set)
     again: bool = False
@@ -116,11 +140,6 @@ class RecordingPlan:
         self.trajectory = at_frames(
             first_T_scan @ invert(self.recording.vehicle_T_scan), self.times
         )
-
-    @property
-    def checked(self) -> str | None:
-        """The recording, for errors of its estimated poses; None if these are not checked."""
-        return None if self.force else self.recording.location
 
     @property
     def rig(self) -> Rig:
@@ -216,31 +235,6 @@ def sequence_path(recording: Recording) -> str:
     return f"{recording.split}/{recording.name}/cartesian"
 
 
-@dataclass(frozen=True)
-class Examined:
-    """What is known of a recording before it is converted.
-
-    Attributes:
-        recording: the recording, with the frames that are converted, and upright.
-        times: (F,) seconds by frame number, by its clock.
-        has_times: whether the recording has times.
-        trajectory: poses of the vehicle by the same clock; None if they must be estimated.
-        poses: (F, 4, 4) first_T_scan by frame number; None if they must be estimated.
-        mount: how the sensor is mounted; None if no ground was found.
-        notes: notes for the user, one line each.
-        findings: what is probably wrong ("warning"), and what stops a conversion ("error").
-    """
-
-    recording: Recording
-    times: FloatArray
-    has_times: bool
-    trajectory: Trajectory | None
-    poses: FloatArray | None
-    mount: Mount | None
-    notes: list[str]
-    findings: list[Finding]
-
-
 def examine(
     recording: Recording,
     converter: Converter,
@@ -269,11 +263,15 @@ def examine(
     notes, findings = list[str | None](), list[Finding]()
     checked = recording.rays and (level or not known)
     mount = find_mount(_some_scans(recording)) if checked else None
-    if level and mount is not None:
+    if not level:
+        findings += check_mount(mount, recording.location, force=False)
+    elif mount is not None:
         recording = _upright(recording, converter, mount, options)
         notes.append(f"scans were turned upright: they show {mount}")
     else:
-        findings += check_mount(mount, recording.location, force=False)
+        raise FormatError(
+            recording.location, expected="ground in the scans, to turn them upright", found="none"
+        )
     own_times = recording.times()
     times = frame_times(recording, own_times)
     trajectory = read_trajectory(recording, options)
@@ -301,7 +299,7 @@ def examine(
             chosen = [handle for handle, there in zip(chosen, posed, strict=True) if there]
             notes.append(
                 f"{np.count_nonzero(~posed)} of {len(posed)} scans have no pose at their time, and "
-                f"are left out: {_ranges(numbers[~posed])}"
+                f"are left out: {first_runs(numbers[~posed].tolist())}"
             )
     if len(chosen) < len(recording.frames):
         recording = ChosenFrames(recording, chosen)
@@ -315,20 +313,27 @@ def examine(
         notes.append("the positions of the sensor are not known, so no grids are made from scans")
     elif poses is None:
         why = "as requested" if options.source == KISS_ICP else "because the recording has none"
-        notes.append(f"poses are estimated from the scans with KISS-ICP, {why}")
+        notes.append(f"poses are estimated from the scans, {why}")
     else:
         if not known:
             try:
                 notes.append(check_poses(recording, converter, poses))
             except FormatError as error:
-                findings.append(Finding.from_error("poses-on-scans", recording.location, error))
+                swapped = None if trajectory is None else _swapped(trajectory)
+                try:
+                    if swapped is None:
+                        raise
+                    other = scan_poses(swapped, recording, times)[:last]
+                    notes.append(check_poses(recording, converter, other))
+                    notes.append(f"quaternions in {swapped.where} are w, x, y, z: scans overlap so")
+                    trajectory, poses = swapped, other
+                except FormatError:
+                    findings.append(Finding.from_error("poses-on-scans", recording.location, error))
         numbers = np.array([handle.number for handle in chosen])
         if jump := describe_jumps(numbers, poses[numbers], times[numbers]):
+            where, expected = recording.location, "poses without jumps"
             advice = f"check whether the poses belong to these scans, or {_ESTIMATE}"
-            expected = "poses without jumps"
-            findings.append(
-                Finding("warning", "pose-jump", recording.location, expected, jump, advice)
-            )
+            findings.append(Finding("warning", "pose-jump", where, expected, jump, advice))
         notes.append(jitter_note(poses))
     if own_times is None and recording.rays:
         notes.append("there are no times: frames are taken to be 0.1 s apart")
@@ -338,12 +343,11 @@ def examine(
     )
 
 
-def _ranges(numbers: IntArray) -> str:
-    """Return some increasing numbers as ranges: "0 to 3, 7"."""
-    parts = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
-    return first_names(
-        f"{part[0]} to {part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts
-    )
+def _swapped(given: Trajectory) -> Trajectory | None:
+    """Return the poses with the other order of quaternions; None if the order is certain."""
+    if given.other is None:
+        return None
+    return replace(given, world_T_vehicle=given.other, other=None)
 
 
 def _some_scans(recording: Recording) -> list[Float32Array]:
@@ -352,11 +356,8 @@ def _some_scans(recording: Recording) -> list[Float32Array]:
     Raises:
         FormatError: none of them is a scan: the error of the first one.
     """
-    rig, scans, frames = (
-        replace(Rig.of(recording), rays=False),
-        list[Float32Array](),
-        recording.frames,
-    )
+    rig, frames = replace(Rig.of(recording), rays=False), recording.frames
+    scans = list[Float32Array]()
     problem: FormatError | None = None
     for row in sorted({*np.linspace(0, len(frames) - 1, _SCANS).astype(int).tolist()}):
         with suppress(CarlascError, OSError):  # the conversion of the frame reports the error
@@ -397,12 +398,10 @@ def plan_recording(
     recording: Recording,
     converter: Converter,
     sink: Sink,
-    target: AxesAndClasses,
+    output: LayoutOptions,
     options: PoseOptions,
     *,
     frames: FrameRange = FrameRange(),  # noqa: B008 (frozen)
-    level: bool = False,
-    flow: bool,
     voxels: bool,
 ) -> RecordingPlan:
     """Read and check the poses, times and boxes of a recording, and find missing frames in the
@@ -412,11 +411,9 @@ def plan_recording(
         recording: the recording.
         converter: the converter.
         sink: the output.
-        target: the axes and classes of the output.
+        output: axes and classes, flow if it is available, and whether scans are turned upright.
         options: where poses come from.
         frames: the frames to convert.
-        level: whether scans are turned upright.
-        flow: whether flow is written, if it is available.
         voxels: whether the recording's own voxel grids are written.
 
     Raises:
@@ -427,7 +424,7 @@ def plan_recording(
     """
     writer = sink.sequence(sequence_path(recording))
     known = options.force or writer.read_document(layout.POSES) is not None
-    seen = examine(recording, converter, options, frames=frames, level=level, known=known)
+    seen = examine(recording, converter, options, frames=frames, level=output.level, known=known)
     if problem := next((one for one in seen.findings if one.severity == "error"), None):
         raise FormatError(
             problem.location,
@@ -438,24 +435,20 @@ def plan_recording(
     recording = seen.recording
     boxes = _read_boxes(recording)
     plan = RecordingPlan(
-        recording,
-        writer,
-        seen.times,
-        seen.trajectory,
-        seen.poses,
-        KISS_ICP if seen.trajectory is None else FILE,
-        boxes,
-        flow and (boxes is not None or (recording.has_labels and recording.has_instances)),
-        _check_voxels(recording, writer, target) if voxels else None,
-        seen.notes,
-        seen.findings,
+        **vars(seen),
+        writer=writer,
+        pose_source=KISS_ICP if seen.trajectory is None else FILE,
+        boxes=boxes,
+        flow=output.flow == "auto"
+        and (boxes is not None or (recording.has_labels and recording.has_instances)),
+        voxels=_check_voxels(recording, writer, output.of(converter)) if voxels else None,
         force=options.force,
+        voxel_m=options.odometry_voxel_m,
     )
-    for handle in recording.frames:
-        if not writer.has("points", handle.number):
-            plan.missing.add(handle.number)
-        if not writer.has("points", handle.number) or not _finished(plan, handle.number):
-            plan.unfinished.add(handle.number)
+    numbers = {handle.number for handle in recording.frames}
+    plan.missing = {number for number in numbers if not writer.has("points", number)}
+    there = numbers - plan.missing
+    plan.unfinished = plan.missing | {n for n in there if not _finished(plan, n)}
     return plan
 
 
@@ -568,7 +561,9 @@ def begin(plan: RecordingPlan, target: AxesAndClasses, metadata: Metadata) -> No
     documents = {layout.METADATA: agree_metadata(writer, described)}
     if plan.again and existing is not None:
         documents[layout.METADATA] = described.to_json()
-    documents[layout.TIMES] = agree_lines(writer, layout.TIMES, plan.times - plan.times[0])
+    documents[layout.TIMES] = agree_lines(
+        writer, layout.TIMES, plan.times - plan.times[0], is_whole=plan.again
+    )
     if plan.voxels is not None:
         documents[layout.params_file(layout.grid_folder(plan.voxels))] = to_json(
             _voxel_params(plan.voxels, target)
@@ -594,7 +589,9 @@ def write_poses(plan: RecordingPlan, target: AxesAndClasses) -> None:
     if plan.again and plan.pose_source == KISS_ICP:
         _write(plan, {layout.POSES: layout.encode_poses(poses)})
     else:
-        _write(plan, {layout.POSES: agree_lines(plan.writer, layout.POSES, poses)})
+        _write(
+            plan, {layout.POSES: agree_lines(plan.writer, layout.POSES, poses, is_whole=plan.again)}
+        )
 
 
 def _places(extra: Mapping[str, Any]) -> list[object]:
@@ -617,10 +614,10 @@ def write_found(plan: RecordingPlan, height_m: float | None) -> None:
         return
     metadata = Metadata.from_json(data, f"{plan.writer.location}/{layout.METADATA}")
     extra = dict(metadata.extra)
-    sensors = [dict(sensor) for sensor in extra.get("sensors", [])]
-    if height_m is not None and sensors and "height_m" not in sensors[0]:
-        sensors[0] |= {"height_m": round(height_m, 2), "height_from": "ground"}
-        extra["sensors"] = sensors
+    if height_m is not None and extra.get("sensors") and metadata.height_m is None:
+        first, *others = extra["sensors"]
+        found = {"height_m": round(height_m, 2), "height_from": "ground"}
+        extra["sensors"] = [{**first, **found}, *others]
     if plan.findings and "findings" not in extra:
         extra["findings"] = _recorded(plan.findings)
     if extra != metadata.extra:
@@ -794,14 +791,9 @@ class _ReadUsable:
 
 
 def estimate_poses(
-    recording: Recording,
-    converter: Converter,
-    times: FloatArray,
-    step: Callable[[], object],
-    run: Run,
-    checked: str | None,
+    plan: RecordingPlan, converter: Converter, step: Callable[[], object], run: Run
 ) -> FloatArray:
-    """Estimate the pose of each scan with KISS-ICP.
+    """Estimate the pose of each scan with odometry.
 
     A frame without a scan gets the pose of the scan before it.
 
@@ -810,12 +802,10 @@ def estimate_poses(
     scans with too few points.
 
     Args:
-        recording: its scans.
+        plan: its scans, and how their poses are estimated.
         converter: the converter, for the range of points to use.
-        times: (F,) seconds by frame number.
         step: called for each frame.
         run: how the reading of scans is spread.
-        checked: the recording, for errors; None if the poses are accepted without a check.
 
     Returns:
         (F, 4, 4) first_T_scan by frame number, right-handed.
@@ -825,11 +815,11 @@ def estimate_poses(
         MissingDataError: no scan has enough points.
         DependencyError: kiss-icp is not installed.
     """
-    rig = Rig.of(recording)
+    recording = plan.recording
     errors: list[CarlascError | OSError] = []
 
     def scans() -> Iterator[tuple[int, UsableScan]]:
-        with closing(run_all(_ReadUsable(rig), recording.frames, run)) as read:
+        with closing(run_all(_ReadUsable(plan.rig), recording.frames, run)) as read:
             for handle, scan in zip(recording.frames, read, strict=True):
                 step()
                 if isinstance(scan, Exception):
@@ -837,26 +827,22 @@ def estimate_poses(
                 else:
                     yield handle.number, scan
 
-    poses = dict(follow(scans(), converter, times, checked))
+    poses = dict(follow(scans(), converter, plan))
     if len(errors) == len(recording.frames):
         raise errors[0]
     return fill_gaps(poses, recording)
 
 
 def follow(
-    scans: Iterable[tuple[int, UsableScan]],
-    converter: Converter,
-    times: FloatArray,
-    checked: str | None,
+    scans: Iterable[tuple[int, UsableScan]], converter: Converter, plan: RecordingPlan
 ) -> Iterator[tuple[int, FloatArray]]:
     """Yield the frame number and the (4, 4) first_T_scan of each scan with enough points, estimated
-    with KISS-ICP.
+    with odometry.
 
     Args:
         scans: frame numbers and scans, in order.
         converter: the converter, for the range of points to use.
-        times: (F,) seconds by frame number.
-        checked: the recording, for errors; None if the poses are accepted without a check.
+        plan: how poses are estimated; gets a note on what was chosen.
 
     Raises:
         DependencyError: kiss-icp is not installed.
@@ -872,7 +858,7 @@ def follow(
         for number, scan in scans:
             if len(scan[0]) >= odometry.MIN_POINTS:
                 numbers.append(number)
-                read_at.append(float(times[number]))
+                read_at.append(float(plan.times[number]))
                 centres.add(scan[0])
                 yield scan
 
@@ -881,13 +867,15 @@ def follow(
             usable(),
             times=read_at,
             min_range_m=converter.min_range_m or 0.0,
-            max_range_m=converter.max_range_m or 100.0,
+            max_range_m=plan.max_range_m or converter.max_range_m or 100.0,
+            voxel_m=plan.voxel_m,
+            note=plan.notes.append,
         )
     ):
         poses.append(pose)
         yield numbers[index], pose
-    if poses and checked is not None:
-        centres.check(np.stack(poses), checked)
+    if poses and not plan.force:
+        check_standing(centres, np.stack(poses), plan.recording.location)
 
 
 def fill_gaps(poses: Mapping[int, FloatArray], recording: Recording) -> FloatArray:

@@ -8,37 +8,38 @@ sequence keeps.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from carlasc.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray
-from carlasc.core.geometry import Transform, axes_named
+from carlasc.core.geometry import DIRECTIONS, Transform, poses_from, thin
+from carlasc.core.scans import ScanCentres
 from carlasc.errors import FormatError
 from carlasc.inspection.findings import Finding, Severity
 from carlasc.motion.ground import ground_plane
 
+_ENOUGH = 30000  # points of a scan in which the ground is looked for
 _SAMPLE = 4000  # points of a scan that say how far away they are
 # no LiDAR on a carrier sees half of its points, or all of them, so far away
 _FARTHEST_M, _ALL_FAR_M = 2000.0, 250.0
-_LONGEST_S = 3.0  # points are taken within this time of their frame
+_LONGEST_S = 3.0  # points are taken within this time of their frame; fact: longest-frame
 
-POSE_S = 0.25
+POSE_S = 0.25  # fact: pose-reach
 """Scans this near in time to the first or the last pose get a pose."""
-_GAP_S, _USUAL_GAPS = 1.0, 5.0  # poses are interpolated over this time, or so many usual intervals
+_GAP_S = 1.0  # poses are interpolated over this time; fact: pose-gap
+_USUAL_GAPS = 5.0  # or over so many usual intervals
 
 # Up in the axes of the sensor, the most likely first, and the axes that it belongs to.
 _UPS = (("+z", "flu"), ("-z", "frd"), ("-y", "rdf"), ("+y", "rub"), ("+x", "ulb"), ("-x", "dlf"))
 _LEVEL, _STEEP = 0.25, 0.8  # slopes of the ground of an upright sensor, and of a tilted one
 _LEAST_M = 0.2  # ground must be at least this far below the sensor
 # Ground in an unusual direction reaches beyond this distance, in this share of all directions, and
-# at most this share of the points is below it: so do no walls and ceilings.
-_WIDE_M, _WIDE, _BELOW_M, _BELOW = 8.0, 0.2, 0.5, 0.03
+# at most this share of the near points is below it: so do no walls and ceilings.
+_WIDE_M, _WIDE = 8.0, 0.3
+_NEAR_M, _BELOW_M, _BELOW = 15.0, 0.5, 0.02
 _SECTORS, _ON_GROUND_M = 36, 0.1
 _TILTED, _FALLEN = 5.0, 14.0  # degrees: grids, and the ground below the sensor, need less
-
-_CENTRE_M, _STANDING = 3.0, 0.2  # a scan that moves so far cannot belong to a sensor that stands
-_NEARER = 1.3  # factor by which the distance of the nearest points then changes
 
 
 def check_scan(points: Float32Array, seconds: AnyFloatArray | None, where: str) -> None:
@@ -122,52 +123,59 @@ def find_mount(scans: Sequence[AnyFloatArray]) -> Mount | None:
     Args:
         scans: (N, 3 or more) points, metres, in the frame of the sensor.
     """
+    usual = _mount(scans, *_UPS[0], _LEVEL, certain=False)
+    if usual is not None and usual.degrees < _TILTED:
+        return usual
     for ups in (_UPS[:2], _UPS[2:]):
         for steepest in (_LEVEL, _STEEP):
             for up, axes in ups:
-                turn = axes_named(axes)
-                unusual = up != "+z" or steepest > _LEVEL
-                planes = [
-                    plane
-                    for points in scans
-                    if (plane := _ground(points[:, :3] @ turn[:3, :3].T, steepest, unusual))
-                    is not None
-                ]
-                if 2 * len(planes) <= len(scans):
-                    continue
-                # whole tenths of a degree, so that other scans give the same rotation
-                slope = np.median(planes, axis=0)
-                normal = np.array([-slope[0], -slope[1], 1.0]) / np.hypot(1, np.hypot(*slope[:2]))
-                degrees = round(float(np.rad2deg(np.arccos(normal[2]))), 1)
-                return Mount(
-                    up, axes, degrees, -float(slope[2] * normal[2]), _level(normal, degrees) @ turn
-                )
-    return None
+                if found := _mount(scans, up, axes, steepest, certain=True):
+                    return found
+    # stairs, or a slope: the sensor is not certainly tilted
+    return None if usual is None else replace(usual, degrees=0.0, level_T_scan=np.eye(4))
 
 
-def _ground(points: AnyFloatArray, steepest: float, unusual: bool) -> FloatArray | None:
-    """Return the plane of the ground, as `ground_plane` does; None if it cannot be ground."""
+def _mount(
+    scans: Sequence[AnyFloatArray], up: str, axes: str, steepest: float, *, certain: bool
+) -> Mount | None:
+    """Return the mount of a sensor with these axes; None if most scans show no ground then."""
+    turn = np.eye(4)
+    turn[:3, :3] = np.transpose([DIRECTIONS[letter] for letter in axes])
+    grounds = [
+        ground
+        for points in scans
+        if (ground := _ground(thin(points, _ENOUGH)[:, :3] @ turn[:3, :3].T, steepest, certain))
+        is not None
+    ]
+    if 2 * len(grounds) <= len(scans):
+        return None
+    x, y, z = np.median(grounds, axis=0)
+    slope = float(np.hypot(x, y))
+    # whole tenths of a degree, so that other scans give the same rotation
+    degrees = round(float(np.rad2deg(np.arctan(slope))), 1)
+    half = np.deg2rad(degrees) / 2
+    along = np.array([-y, x, 0.0]) / max(slope, 1e-9)  # the axis of the smallest rotation to level
+    level = poses_from(np.array([[np.cos(half), *np.sin(half) * along]]), np.zeros((1, 3)))[0]
+    return Mount(up, axes, degrees, -float(z / np.hypot(1.0, slope)), level @ turn)
+
+
+def _ground(points: AnyFloatArray, steepest: float, certain: bool) -> FloatArray | None:
+    """Return the plane of the ground, as `ground_plane` does; None if it is not below the sensor,
+    or, to be `certain`, if it is not wide, or has points below it.
+    """
     plane = ground_plane(points, steepest)
     if plane is None or plane[2] > -_LEAST_M:
         return None
-    if unusual:
+    if certain:
         x, y, z = points.T
         above = z - plane[0] * x - plane[1] * y - plane[2]
-        far = (np.abs(above) < _ON_GROUND_M) & (np.hypot(x, y) > _WIDE_M)
+        flat = np.hypot(x, y)
+        far = (np.abs(above) < _ON_GROUND_M) & (flat > _WIDE_M)
         sectors = np.unique(np.arctan2(y, x)[far] // (2 * np.pi / _SECTORS))
-        if len(sectors) < _WIDE * _SECTORS or np.mean(above < -_BELOW_M) > _BELOW:
+        below = np.mean(above[flat < _NEAR_M] < -_BELOW_M)
+        if len(sectors) < _WIDE * _SECTORS or below > _BELOW:
             return None
     return plane
-
-
-def _level(normal: FloatArray, degrees: float) -> Transform:
-    """Return the smallest (4, 4) rotation of an upward direction to z, by this angle."""
-    turn, flat, angle = np.eye(4), np.hypot(normal[0], normal[1]), np.deg2rad(degrees)
-    if degrees:
-        x, y = normal[:2] / flat
-        axis = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0.0]])
-        turn[:3, :3] += np.sin(angle) * axis + (1 - np.cos(angle)) * axis @ axis
-    return turn
 
 
 def check_mount(mount: Mount | None, where: str, *, force: bool) -> list[Finding]:
@@ -184,38 +192,18 @@ def check_mount(mount: Mount | None, where: str, *, force: bool) -> list[Finding
     return [Finding(severity, "mount", where, expected, str(mount), advice)]
 
 
-@dataclass
-class ScanCentres:
-    """Where the points of the scans are, which shows whether a sensor moves."""
+def check_standing(centres: ScanCentres, poses: FloatArray, where: str) -> None:
+    """Check the (F, 4, 4) poses that odometry found of scans.
 
-    _centres: list[tuple[float, float, float]] = field(default_factory=list)
-
-    def add(self, points: AnyFloatArray) -> None:
-        """Add (N, 3) points of the next scan, N > 0."""
-        sample = points[:: max(1, len(points) // _SAMPLE)]
-        x, y = np.median(sample[:, :2], axis=0)
-        nearest = np.percentile(np.hypot(sample[:, 0], sample[:, 1]), 1)
-        self._centres.append((float(x), float(y), float(nearest)))
-
-    def check(self, poses: FloatArray, where: str) -> None:
-        """Check the (F, 4, 4) poses that odometry found of these scans.
-
-        Raises:
-            FormatError: the sensor stands, although its scans are taken from other and other
-                places.
-        """
-        centres, places = np.array(self._centres), poses[:, :2, 3]
-        part = max(1, len(centres) // 5)
-        first, last = np.median(centres[:part], axis=0), np.median(centres[-part:], axis=0)
-        moved = float(np.hypot(*(last - first)[:2]))
-        way = float(np.hypot(*(places - places[0]).T).max())
-        nearest = np.array([np.min(centres[:, 2]), np.max(centres[:, 2])]) + 1e-3
-        if moved > _CENTRE_M and way < _STANDING * moved and nearest[1] > _NEARER * nearest[0]:
-            raise FormatError(
-                where,
-                expected="scans in the frame of the sensor",
-                found=f"scans that stay where they are, while their centres move by {moved:.1f} m: "
-                f"they are in the world frame",
-                advice="transform them by the inverse of the pose of each scan, and give these "
-                "poses; or accept them with `force=True`",
-            )
+    Raises:
+        FormatError: the sensor stands, although its scans are taken from other and other places.
+    """
+    if moved_m := centres.moved_m(poses):
+        raise FormatError(
+            where,
+            expected="scans in the frame of the sensor",
+            found=f"scans that stay where they are, while their centres move by {moved_m:.1f} m: "
+            f"they are in the world frame",
+            advice="transform them by the inverse of the pose of each scan, and give these poses; "
+            "or accept them with `force=True`",
+        )

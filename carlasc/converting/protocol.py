@@ -138,6 +138,8 @@ class Trajectory:
         seconds: (K,) time of each pose, increasing, by the clock of `Recording.times`; None if pose
             i is that of frame i.
         where: the file of the poses, for errors.
+        other: (K, 4, 4) the poses if the file has w first in quaternions, which is tried if scans
+            do not overlap; None if the order is certain.
 
     Raises:
         FormatError: shapes do not match, a pose is not rigid, times do not increase, or a time is
@@ -147,6 +149,7 @@ class Trajectory:
     world_T_vehicle: FloatArray
     seconds: FloatArray | None = None
     where: str = "poses"
+    other: FloatArray | None = None
 
     def __post_init__(self) -> None:
         check_rigid(self.world_T_vehicle, self.where)
@@ -365,11 +368,13 @@ class Failure:
         sequence: location of its sequence in the source.
         frame: its number.
         message: the error, in one line.
+        waits: whether it only waits for another frame, which failed.
     """
 
     sequence: str
     frame: int
     message: str
+    waits: bool = False
 
 
 def check_outside(out: Path, source: str) -> None:

@@ -4,27 +4,34 @@ from these sequences.
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Collection, Mapping
 from collections.abc import Sequence as Series
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from carlasc.converting.assembling import LayoutOptions
-from carlasc.converting.plans import SplitName, choose_recordings, plan_recording, sequence_path
+from carlasc.converting.plans import (
+    KISS_ICP,
+    RecordingPlan,
+    SplitName,
+    choose_recordings,
+    plan_recording,
+    sequence_path,
+)
 from carlasc.converting.protocol import Converter, Failure, Recording, check_outside
 from carlasc.converting.registry import find_recordings, open_converter
-from carlasc.converting.sources import SourceFiles
 from carlasc.converting.stages import Conversion
 from carlasc.core.choices import CompareInputs
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError, check_choice, check_types
-from carlasc.groundtruth.options import FromScans, GridOptions, Voting, fit_to_ground
+from carlasc.groundtruth.options import FromScans, GridOptions, Voting, fit_to_ground, fit_to_reach
 from carlasc.groundtruth.run import regrid
 from carlasc.inspection.findings import Finding
 from carlasc.motion.ground import Ground, joined
@@ -32,6 +39,14 @@ from carlasc.motion.options import PoseOptions
 from carlasc.running.processes import one_pool
 from carlasc.running.spreading import Part, Run, StepCounter
 from carlasc.storage.files import AnyPath
+from carlasc.storage.inputs import (
+    UNKNOWN,
+    MadeFrom,
+    changed_names,
+    combined,
+    folder_states,
+    made_again,
+)
 from carlasc.storage.layout import Metadata
 from carlasc.storage.opening import as_sink
 from carlasc.storage.protocol import Sequence, Sink, Source
@@ -39,6 +54,8 @@ from carlasc.storage.transport.remote_tree import check_shared
 from carlasc.storage.transport.trees import LocalTarget
 
 Grids = GridOptions | Literal["voxels"] | None
+_RECORD = "conversion"
+_GAP = "gap"  # in the record: a frame that failed, and others were finished without it
 _LOOKED_AT = (
     3  # number of sequences, and of scans of each, in which points outside of the grid are counted
 )
@@ -82,8 +99,6 @@ def convert(
     poses: PoseOptions = PoseOptions(),  # noqa: B008 (frozen)
     grids: Grids = GridOptions(),  # noqa: B008 (frozen)
     options: Mapping[str, Any] | None = None,
-    compare_inputs: CompareInputs = "fast",
-    allow_gaps: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> ConvertResult:
     """Write another data set as sequences of the CarlaSC layout: the same files, axes and classes;
@@ -104,18 +119,14 @@ def convert(
         sequences: which ones, by their names or the last part of them ("00"); None converts all.
         frames: numbers of the frames to convert, of every sequence; None converts all.
         split: "train", "val" or "test": only sequences of this split; "all" converts every split.
-        layout: how sequences are written: their classes, their axes, and whether they get flow.
+        layout: how sequences are written: their classes, their axes, whether they get flow, and
+            how changes of the data set are noticed.
         poses: where poses come from, and whether poses are accepted if scans do not overlap under
             them, or if a calibration is missing.
         grids: the grids that are made from scans merged over time; "voxels" takes the data set's
             own voxels, with count 0 where they are unknown; None writes no grids.
         options: options of the converter, by name; text is parsed as the type of the option (see
             `option_declarations`).
-        compare_inputs: how it is found out whether the data set changed: "fast": by the names,
-            sizes and times of its files; "content": all frames are made again and compared;
-            "never": existing frames are kept.
-        allow_gaps: finish frames that take labels, motion or votes from a frame that failed.
-            Otherwise they wait until it is repaired.
         run: how the work is spread. A part converts whole recordings, because poses and motion are
             estimated along each of them. Grids then keep their height, because the ground of the
             other recordings is not known.
@@ -137,40 +148,39 @@ def convert(
     target, sink = layout.of(converter), as_sink(out, part=run.part)
     check_shared(sink.location, run)
     _check(root, sink, split, grids, run.part)
-
-    check_choice("compare_inputs", compare_inputs, CompareInputs)
+    compare = layout.compare_inputs
     found = find_recordings(converter)
-    recordings = choose_recordings(found, root, sequences, split)
-    recordings = _deal(recordings, run.part)
+    recordings = _deal(choose_recordings(found, root, sequences, split), run.part)
     if isinstance(grids, GridOptions):
         _check_rays(recordings)
-    has_flow, has_voxels = layout.flow == "auto", isinstance(grids, str)
+    has_voxels, chosen = isinstance(grids, str), FrameRange.of(frames)
     plans = []
-    for one in recordings:
+    for one in recordings:  # in Python 3.11, a comprehension is a level of calls
         planned = plan_recording(
-            one,
-            converter,
-            sink,
-            target,
-            poses,
-            frames=FrameRange.of(frames),
-            level=layout.level,
-            flow=has_flow,
-            voxels=has_voxels,
+            one, converter, sink, layout, poses, frames=chosen, voxels=has_voxels
         )
         plans.append(planned)
-    sources = SourceFiles.of(root, found, options, compare_inputs)
-    records = [sources.begin(plan) for plan in plans]
+    if isinstance(grids, GridOptions) and isinstance(grids.observe, FromScans):
+        for plan in plans:
+            plan.max_range_m = grids.observe.max_range_m
+    states = None if compare == "never" else _source_states(root, found, options)
+    records = []
+    for plan in plans:
+        own = None if states is None else states[None] | states.get(plan.recording.location, {})
+        records.append(_ConvertedFrom(plan, own))
+        records[-1].begin(compare)
     origin = f"{name if isinstance(name, str) else name.__name__} {root.name}"
     ranges = converter.min_range_m, converter.max_range_m
     said = {name: getattr(converter, name) for name in ("license", "citation", "simulated")}
     known = {key: value for key, value in said.items() if value not in (None, False)}
     metadata = Metadata(layout.axes, target.classes, converter.sensor, *ranges, origin, known)
 
-    steps = StepCounter(run.progress, sum(len(plan.recording.frames) for plan in plans))
+    every = sum(len(plan.recording.frames) for plan in plans)
+    in_grids = every if isinstance(grids, GridOptions) else 0
+    steps = StepCounter(run.progress, every + in_grids)
     with one_pool(run) as pooled:
         conversions = [
-            Conversion(plan, converter, target, layout.images, pooled, steps, allow_gaps)
+            Conversion(plan, converter, target, layout.images, pooled, steps, layout.allow_gaps)
             for plan in plans
         ]
         with ExitStack() as writers:
@@ -183,7 +193,7 @@ def convert(
             sink.finish(incomplete=True)  # missing frames could not be read, and are reported
         made = None
         if isinstance(grids, GridOptions):
-            alone = replace(pooled, part=Part(), progress=steps.stage())
+            alone = replace(pooled, part=Part(), progress=steps.stage(in_grids))
             # without the motion that some frames wait for, grids would be made in another way
             converted = [one for one in conversions if one.has_scans and not one.waits]
             if converted:  # otherwise every frame failed, and is reported
@@ -196,7 +206,7 @@ def convert(
                     out,
                     observe=observe,
                     voting=voting,
-                    compare_inputs=compare_inputs,
+                    compare_inputs=compare,
                     run=alone,
                 )
                 made = replace(made, notes=(*cut, *made.notes))
@@ -217,6 +227,86 @@ def convert(
         tuple(finding for plan in plans for finding in plan.findings),
         time.perf_counter() - start,
     )
+
+
+@dataclass
+class _ConvertedFrom:
+    """The states of the files that a recording is converted from, and their record.
+
+    A frame may depend on any file of its recording, because tracks and estimated poses reach over
+    all scans, and a converter reads files in its own way. So after a change, all frames of the
+    recordings that may have been read from the changed files are made again, and those that differ
+    are written.
+
+    Attributes:
+        plan: the recording and its output.
+        states: the states of its folders now; None if they are not recorded.
+        notes: what was made again, and why, one line each.
+    """
+
+    plan: RecordingPlan
+    states: Mapping[str, str] | None
+    notes: list[str] = field(default_factory=list)
+
+    def begin(self, compare: CompareInputs) -> None:
+        """Compare the files with those that an earlier output was made from; if they differ, all
+        frames are made again.
+        """
+        plan, states = self.plan, self.states
+        self._before = before = MadeFrom.read(plan.writer, _RECORD)
+        if states is None:
+            return
+        exists = len(plan.missing) < len(plan.recording.frames)
+        is_other = before.own != states or _GAP in before.frames.values()
+        if exists and (compare == "content" or (before.whole and is_other)):
+            plan.make_again()
+        elif exists and not before.whole:
+            self.states = None
+            self.notes.append(f"{plan.writer.location}: {UNKNOWN}")
+        else:
+            self._write(())
+
+    def finish(self, conversion: Conversion) -> None:
+        """Write the record, after the frames were written."""
+        if self.plan.again:
+            conversion.remove_others(map(int, self._before.frames))
+            if conversion.changed:
+                why = changed_names(self._before.own, self.states or {})
+                where = self.plan.writer.location
+                self.notes.append(f"{where}: {made_again(conversion.changed, why)}")
+        has_gaps = conversion.allow_gaps or self.plan.pose_source == KISS_ICP
+        self._write(conversion.failed if has_gaps else ())
+
+    def _write(self, gaps: Collection[int]) -> None:
+        """Write the record of the states of now, unless they are not recorded."""
+        if self.states is not None:
+            own = dict(self.states)
+            numbers = [handle.number for handle in self.plan.recording.frames]
+            frames = {str(number): _GAP if number in gaps else "done" for number in numbers}
+            MadeFrom(combined(sorted(own.items())), own, frames).write(self.plan.writer, _RECORD)
+
+
+def _source_states(
+    root: Path, recordings: Series[Recording], options: Mapping[str, Any] | None
+) -> dict[str | None, dict[str, str]]:
+    """Return the states of the folders of a data set, and of files that options name, by the
+    location of the recording that they belong to; by None if they may belong to all.
+    """
+    places = {"": root}
+    for name, value in (options or {}).items():
+        if isinstance(value, str | os.PathLike) and str(value) and Path(value).exists():
+            places[f"--{name}"] = Path(value)
+    owners = {
+        Path(one.location).relative_to(root).as_posix(): one.location
+        for one in recordings
+        if Path(one.location).is_relative_to(root) and Path(one.location) != root
+    }
+    states: dict[str | None, dict[str, str]] = {None: {}}
+    for name, state in folder_states(places).items():
+        above = [str(place) for place in (Path(name), *Path(name).parents)]
+        owner = next((owners[place] for place in above if place in owners), None)
+        states.setdefault(owner, {})[name] = state
+    return states
 
 
 class _ConvertedScans(Source):
@@ -241,16 +331,23 @@ def _plan_grids(
     """Return the grid of the converted sequences, how scans are merged, and notes for the user.
 
     All grids have the same bounds, so that they can be in one training set: the bounds of the
-    options, moved to the height of the ground if `follow_ground` is set.
+    options, fitted to the ground and to the reach of points if `follow_ground` is set.
     """
     spec, notes = grids.spec or GridSpec.published(), list[str]()
     if grids.follow_ground:
-        spec, notes = _fit(
-            spec, [one.ground for one in conversions if one.ground is not None], scans.location
-        )
+        reach_m = max(one.reach_m for one in conversions)
+        whole, spec = spec, fit_to_reach(spec, reach_m)
+        grounds = [one.ground for one in conversions if one.ground is not None]
+        spec, notes = _fit(spec, grounds, scans.location)
+        if spec.upper[0] != whole.upper[0]:
+            notes.append(
+                f"{scans.location}: nearly all points are within {reach_m:.1f} m, so grids reach "
+                f"{spec.upper[0]:g} m instead of {whole.upper[0]:g} m to each side, with voxels of "
+                f"{spec.voxel_size[0]:.2g} m; give --bounds to keep them"
+            )
+    poses = replace(poses, source="file") if poses.source == KISS_ICP else poses  # now in poses.txt
     observe = replace(
-        grids.observe if isinstance(grids.observe, FromScans) else FromScans(),
-        poses=replace(poses, source="file"),
+        grids.observe if isinstance(grids.observe, FromScans) else FromScans(), poses=poses
     )
     return spec, observe, notes + _what_is_cut(spec, scans)
 

@@ -69,6 +69,7 @@ VOXEL_FILES = "voxels_kitti"
 write them again.
 """
 
+_NEARLY_ALL = 0.99  # share of the points within the reach of a recording
 _GROUND_FRAMES = 5  # scans in which the ground is looked for
 _NEAR_M = 250.0  # boxes farther away from the sensor hold no points
 _FRAMES = 8  # frames per task if each has its own files, because a task costs more than a frame
@@ -275,6 +276,7 @@ class Conversion:
         allow_gaps: whether frames are finished that take labels or motion from a frame that failed.
         ground: the ground in some of its scans; None if none was found, or scans cannot be read
             back.
+        reach_m: nearly all points of these scans are nearer, metres, seen from above.
     """
 
     plan: RecordingPlan
@@ -287,6 +289,7 @@ class Conversion:
     failures: list[Failure] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     ground: Ground | None = None
+    reach_m: float = np.inf
     _failed: set[int] = field(default_factory=set)
     _held: set[int] = field(default_factory=set)
     _changed: set[int] = field(default_factory=set)
@@ -300,16 +303,7 @@ class Conversion:
         # the poses correct the scans: each scan is read twice
         if plan.poses is None and plan.rig.needs_motion:
             self.steps.expect(len(plan.recording.frames))
-            plan.take_estimate(
-                estimate_poses(
-                    plan.recording,
-                    self.converter,
-                    plan.times,
-                    self.steps,
-                    self.run_options,
-                    plan.checked,
-                )
-            )
+            plan.take_estimate(estimate_poses(plan, self.converter, self.steps, self.run_options))
             write_poses(plan, self.target)
         velocities = self._read_scans()
         if plan.poses is not None:
@@ -446,7 +440,7 @@ class Conversion:
                     waiting[result.number] = result
                     yield result.number, (points, None)
 
-        for number, pose in follow(scans(), self.converter, self.plan.times, self.plan.checked):
+        for number, pose in follow(scans(), self.converter, self.plan):
             yield waiting.pop(number), pose
 
     def _work(self, blocks: Sequence[Block]) -> Iterator[ConvertedFrame]:
@@ -491,6 +485,7 @@ class Conversion:
                 plan.recording.location,
                 number,
                 f"{plan.recording.location}: frame {number} waits for {waits_for(failed)}",
+                waits=True,
             )
             for number, failed in sorted(waiting.items())
             if number in todo
@@ -605,13 +600,18 @@ class Conversion:
             and (points := plan.writer.read("points", number)) is not None
         ]
         self.ground = find_ground(scans)
+        away = np.concatenate([np.empty(0), *(np.hypot(*points[:, :2].T) for points in scans)])
+        if len(away):
+            self.reach_m = float(np.quantile(away, _NEARLY_ALL))
         if plan.recording.rays and not plan.findings:
             plan.findings += check_mount(find_mount(scans), plan.recording.location, force=True)
         write_found(plan, None if self.ground is None else self.ground.below_m)
 
     def _remarks(self) -> list[str]:
         plan = self.plan
-        notes = [*plan.recording.notes(), *plan.notes]
+        notes, every = [*plan.recording.notes(), *plan.notes], len(plan.recording.frames)
+        if 0 < (existing := every - len(plan.unfinished)) < every:
+            notes.append(f"an earlier run was continued: {existing} of {every} frames existed")
         if self.waits:
             notes.append("its grids wait, too, until all frames are converted")
         unlabelled = sum(not handle.labelled for handle in plan.recording.frames)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from carlasc.core.arrays import AnyFloatArray, BoolArray, Int32Array, IntArray
+from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray, Int32Array, IntArray
 from carlasc.core.compiling import cached, fused, inlined, jit
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import GridSpec
@@ -234,3 +234,28 @@ def _count(points: AnyFloatArray, pose: Pose, cells: Cells, counts: Int32Array) 
         voxel = find_voxel(x, y, z, cells)
         if voxel < len(counts):
             counts[voxel] += 1
+
+
+def warped_voxels(
+    points: FloatArray, spec: GridSpec, warps: FloatArray, later_s: float = 0.0
+) -> IntArray:
+    """Return (W, N) voxels of (N, 3) points under (W, 3, 5) maps p' = A p + b + c dt, as columns A,
+    b, c, where `later_s` is dt in seconds; outside, the number of voxels.
+    """
+    voxels = np.empty((len(warps), len(points)), np.int64)
+    _find_warped(points, np.ascontiguousarray(warps), later_s, Cells.of(spec), voxels)
+    return voxels
+
+
+@cached
+def _find_warped(points, maps, later_s, cells, voxels):  # type: ignore[no-untyped-def]
+    for w in range(len(maps)):
+        m = maps[w]
+        for i in range(len(points)):
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            voxels[w, i] = find_voxel(
+                m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3] + m[0, 4] * later_s,
+                m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3] + m[1, 4] * later_s,
+                m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] + m[2, 4] * later_s,
+                cells,
+            )

@@ -164,16 +164,14 @@ class ClassTable:
         def swapped(ids: Iterable[int]) -> list[int]:
             return [swap.get(i, i) for i in ids]
 
+        roles: dict[str, Any] = {role: frozenset(swapped(getattr(self, role))) for role in ROLES}
         return replace(
             self,
             name=f"{self.name}-free0",
             names=dict(sorted(zip(swapped(self.names), self.names.values(), strict=True))),
             colors=dict(sorted(zip(swapped(self.colors), self.colors.values(), strict=True))),
             free=0,
-            moving=frozenset(swapped(self.moving)),
-            movable=frozenset(swapped(self.movable)),
-            deformable=frozenset(swapped(self.deformable)),
-            ground=frozenset(swapped(self.ground)),
+            **roles,
         )
 
     @cached_property
@@ -232,18 +230,12 @@ class ClassTable:
         numbers of occurrences.
         """
         top = max(self.names)
-        if not labels.size or (
-            int(labels.min()) >= 0 and int(labels.max()) <= top == len(self.names) - 1
-        ):
-            return {}
-        if labels.dtype.kind == "u" and int(labels.max()) <= top:
+        if labels.size and int(labels.min()) >= 0 and int(labels.max()) <= top:
             listed = np.zeros(top + 1, np.bool_)
-            listed[list(self.names)] = True
-            if listed[labels].all():
+            listed[[*self.names]] = True
+            if len(self.names) > top or listed[labels].all():
                 return {}
-        ids, counts = np.unique(labels, return_counts=True)
-        found = zip(ids.tolist(), counts.tolist(), strict=True)
-        return {i: n for i, n in found if i not in self.names}
+        return {i: n for i, n in ids_in(labels).items() if i not in self.names}
 
     def check(self, labels: AnyIntArray, where: str) -> None:
         """Raise a FormatError if an id in `labels`, of any shape, is no class of the table.
@@ -302,6 +294,12 @@ def tables_with(ids: Collection[int], like: ClassTable) -> list[ClassTable]:
     return sorted(tables, key=lambda t: (not t.name.startswith(like.name), len(t.names)))
 
 
+def ids_in(labels: AnyIntArray) -> dict[int, int]:
+    """Return the ids in labels, of any shape, with their numbers of occurrences."""
+    ids, counts = np.unique(labels, return_counts=True)
+    return dict(zip(ids.tolist(), counts.tolist(), strict=True))
+
+
 def times(counts: Mapping[int, int]) -> str:
     """Return ids with their numbers of occurrences, for messages: "23 (4 times), 24 (2 times)"."""
     return ", ".join(f"{i} ({n} times)" for i, n in counts.items())
@@ -353,10 +351,7 @@ class Remap:
         """Return the ids in `labels`, of any shape, that are not in the mapping, with their number
         of occurrences.
         """
-        ids, counts = np.unique(labels, return_counts=True)
-        return {
-            int(i): int(n) for i, n in zip(ids, counts, strict=True) if int(i) not in self.mapping
-        }
+        return {i: n for i, n in ids_in(labels).items() if i not in self.mapping}
 
     def __call__(self, labels: AnyIntArray, where: str = "labels") -> LabelArray:
         """Return the remapped labels in the dtype of the target. The input is not changed.

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from carlasc.core.arrays import AnyFloatArray, Float32Array, FloatArray
-from carlasc.errors import ArgumentError, FormatError
+from carlasc.errors import FormatError
 
 Floating = TypeVar("Floating", bound=np.floating[Any])
 
@@ -274,39 +274,10 @@ def mirror_poses(poses: FloatArray) -> FloatArray:
     return _MIRROR @ poses @ _MIRROR
 
 
-_DIRECTIONS = dict(
+DIRECTIONS = dict(
     zip("flubrd", (np.concatenate([np.eye(3), -np.eye(3)]) + 0.0).tolist(), strict=True)
 )
-
-
-def axes_named(name: str) -> Transform:
-    """Return (4, 4) from axes that are named by their directions to x forward, y to the left, z up.
-
-    Args:
-        name: a letter for x, y and z each: f(orward), b(ackward), l(eft), r(ight), u(p), d(own).
-            "flu" are those of ROS, "fru" the left-handed ones of CARLA and Unreal, "rfu" have y
-            forward, "rdf" are a camera's.
-
-    Raises:
-        ArgumentError: the letters are not three directions at right angles.
-    """
-    columns = np.array(
-        [_DIRECTIONS.get(letter, (0, 0, 0)) for letter in name.lower()], np.float64
-    ).T
-    if (
-        columns.shape != (3, 3)
-        or not np.array_equal(np.abs(columns).sum(axis=0), [1, 1, 1])
-        or np.linalg.matrix_rank(columns) < 3
-    ):
-        raise ArgumentError(
-            "source_axes",
-            expected="directions of x, y and z, such as flu (forward, left, up), fru, rfu, frd or "
-            "rdf",
-            found=repr(name),
-        )
-    transform = np.eye(4)
-    transform[:3, :3] = columns
-    return transform
+"""Directions f(orward), l(eft), u(p), b(ackward), r(ight), d(own), in x forward, y left, z up."""
 
 
 def choices_of_axes() -> Iterator[tuple[str, FloatArray]]:

@@ -27,6 +27,12 @@ from carlasc.core.grids import GridSpec
 from carlasc.core.notebook import describe
 from carlasc.errors import FormatError, check_types, count
 
+# Points that move by this share of the half of their distances, and more than a metre, while poses
+# move by a fifth of that and the distance of the nearest points changes by a factor, are in a frame
+# that they were moved to.
+_CENTRE, _CENTRE_M, _STANDING, _NEARER = 0.4, 1.0, 0.2, 1.3
+_SAMPLE = 4000  # points of a scan that tell it
+
 _TURN = 65_000  # steps of azimuth per turn, of about 0.1 mrad; they fit into 16 bits
 
 
@@ -276,3 +282,35 @@ def mirror_scan(scan: Scan) -> Scan:
         },
         boxes=None if scan.boxes is None else mirror_boxes(scan.boxes),
     )
+
+
+class ScanCentres:
+    """Where the points of the scans of a drive are."""
+
+    def __init__(self) -> None:
+        self._scans: list[tuple[float, ...]] = []
+
+    def add(self, points: AnyFloatArray) -> None:
+        """Add (N, 3 or more) points of the next scan, metres, N > 0."""
+        sample = points[:: max(1, len(points) // _SAMPLE), :2].astype(np.float64)
+        nearest, half = np.percentile(np.hypot(*sample.T), (1, 50))
+        self._scans.append((*np.median(sample, axis=0), nearest, half))
+
+    def moved_m(self, poses: FloatArray) -> float:
+        """Return how far the points move, metres, if the poses stand meanwhile, as those of scans
+        do that are in the world frame; else 0.
+
+        Args:
+            poses: (F, 4, 4) first_T_sensor.
+        """
+        if not self._scans or not len(poses):
+            return 0.0
+        scans = np.array(self._scans)
+        part = max(1, len(scans) // 5)
+        moved = np.median(scans[-part:], axis=0) - np.median(scans[:part], axis=0)
+        moved_m = float(np.hypot(*moved[:2]))
+        way = np.linalg.norm(poses[:, :2, 3] - poses[0, :2, 3], axis=1).max()
+        nearest = scans[:, 2] + 1e-3
+        stands = way < _STANDING * moved_m and nearest.max() > _NEARER * nearest.min()
+        least = max(_CENTRE_M, _CENTRE * float(np.median(scans[:, 3])))
+        return moved_m if stands and moved_m > least else 0.0

@@ -3,6 +3,7 @@ from .fields import EVIDENCE_FIELDS as EVIDENCE_FIELDS
 from .fields import FIELDS as FIELDS
 from .fields import Sample as Sample
 from .fields import collate as collate
+from .fields import collate_sparse as collate_sparse
 from .labels import RemapLike as RemapLike
 from .photographs import ResizeImages as ResizeImages
 from .samples import Dataset as Dataset

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.arrays import (
+    AnyArray,
     BoolArray,
     Float32Array,
     FloatArray,
@@ -109,3 +110,36 @@ def collate(samples: Sequence[Mapping[str, object]]) -> dict[str, Any]:
     }
     ragged |= {name: [sample[name] for sample in given] for name in given[0] if name in PLAIN}
     return {name: ragged[name] if name in ragged else batch[name] for name in given[0]}
+
+
+def collate_sparse(samples: Sequence[Mapping[str, object]]) -> dict[str, Any]:
+    """Return a batch of samples whose stacks are sparse: voxels and their features.
+
+    Use it as the `collate_fn` of a DataLoader. `occupancy`, `density` and `visibility` become
+    `indices`, (N, 4) int32: the sample in the batch, x, y and z of each voxel that is not zero in
+    all scans, and `features`, (N, C) float32: its values in the T scans of each stack, in the order
+    of the fields. spconv, MinkowskiEngine and torchsparse (2.1) take them as they are. All other
+    fields are collated as by `collate`.
+
+    Raises:
+        ArgumentError: the samples have no stacks.
+        DependencyError: torch is not installed.
+    """
+    check_types(collate_sparse, locals())
+    given: list[Values] = [dict(sample) for sample in samples]
+    names = [name for name in given[0] if name in STACKS] if given else []
+    if not names:
+        expected = f"samples with {', '.join(sorted(STACKS))}"
+        raise ArgumentError("samples", expected=expected, found="none of them")
+    indices: list[AnyArray] = []
+    features: list[AnyArray] = []
+    for number, sample in enumerate(given):
+        stacks = np.concatenate([sample.pop(name) for name in names])
+        cells = np.argwhere(stacks.any(axis=0)).astype(np.int32)
+        indices.append(np.insert(cells, 0, number, axis=1))
+        features.append(stacks[:, *cells.T].T.astype(np.float32))
+    torch = import_extra("torch", "torch")
+    sparse = {"indices": indices, "features": features}
+    return collate(given) | {
+        name: torch.from_numpy(np.concatenate(parts)) for name, parts in sparse.items()
+    }

@@ -13,7 +13,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self, SupportsIndex, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, Self, SupportsIndex, cast, overload
 
 import numpy as np
 
@@ -115,13 +115,11 @@ class Dataset(_MapStyle):
     `occupied`, `flags` and `views` need grids made with `carlasc.Voting(keep_evidence=True)`;
     `instances` and `voxel_flow` need grids made with `keep_actors=True`. Points outside the range
     `min_range_m` to `max_range_m` of carlasc.json are left out. Arrays have the axes of the
-    sequences. Right-handed and left-handed data are mixed only if `axes` is given.
+    sequences, unless `axes` is set.
 
     Attributes:
         sequences: the sequences in use, in order. `sequence` of a sample is the name of one of
             them.
-        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the
-            left).
         classes: table of the class ids in samples, after the remap.
         transform: called with each sample; returns the sample to use. It can be set later (see
             `carlasc.Flip`).
@@ -138,7 +136,6 @@ class Dataset(_MapStyle):
         grids_source: AnyPath | Source | Iterable[AnyPath | Source] | None = None,
         fields: str | Iterable[str] = ("occupancy", "labels", "known"),
         remap: RemapLike = "auto",
-        axes: Axes | None = None,
         align: bool = True,
         inferred: bool = True,
         min_confidence: float = 0.0,
@@ -165,8 +162,6 @@ class Dataset(_MapStyle):
                 (carlasc11 or semantickitti19; other tables keep their ids), a name in
                 `carlasc.core.REMAPS`, a Remap, a mapping of ids, or a table of new ids by old id;
                 None keeps the ids of the data.
-            axes: "left" or "right": mirrors y of sequences with the other axes, which needs a grid
-                that is symmetric in y. None keeps the axes of the data.
             align: move past scans to the sensor frame of the frame by their poses; False stacks
                 them unmoved.
             inferred: False excludes completed voxels, which no scan saw, from `known` and
@@ -216,10 +211,11 @@ class Dataset(_MapStyle):
             )
 
         self.sequences = tuple(part.scans for part in self._parts)
-        handedness = {scans.location: scans.metadata.axes for scans in self.sequences}
-        if axes is not None:
-            check_choice("axes", axes, Axes)
-        self.axes: Axes = common_value(handedness, "axes", "give `axes`") if axes is None else axes
+        self._axes: Axes = common_value(
+            {scans.location: scans.metadata.axes for scans in self.sequences},
+            "axes",
+            "set `axes` of two data sets, and add them",
+        )
         specs = {
             part.grids.location: part.grids.grids[part.grid]
             for part in self._parts
@@ -228,10 +224,25 @@ class Dataset(_MapStyle):
         self._spec = grid if isinstance(grid, GridSpec) else None
         if specs and self._spec is None:
             self._spec = common_value(specs, "grid geometry")
-        if self._spec is not None and set(handedness.values()) != {self.axes}:
-            check_symmetric(self._spec, "y")
         self._label_map = self._make_label_map(remap)
         self.classes: ClassTable = self._label_map.target
+
+    @property
+    def axes(self) -> Axes:
+        """Handedness of the samples: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the
+        left). It is that of the data until another one is set, which mirrors samples in y.
+
+        Raises:
+            ArgumentError: the value is neither, or the grid is not symmetric in y.
+        """
+        return self._axes
+
+    @axes.setter
+    def axes(self, axes: Axes) -> None:
+        check_choice("axes", axes, Axes)
+        if self._spec is not None:
+            check_symmetric(self._spec, "y")
+        self._axes = axes
 
     @property
     def spec(self) -> GridSpec:
@@ -354,6 +365,34 @@ class Dataset(_MapStyle):
             expected=f"the frame of one of the {len(self)} samples",
             found="none",
         )
+
+    def class_counts(self, field: Literal["labels", "point_labels"] = "labels") -> IntArray:
+        """Count the classes of each sample, for samplers that draw rare classes more often.
+
+        All samples are read, without their scans and augmentations.
+
+        Args:
+            field: "labels" counts voxels, without unknown ones if `known` is one of the fields;
+                "point_labels" counts points.
+
+        Returns:
+            (N, K) int64, where K is the largest id of `classes` plus 1.
+
+        Raises:
+            ArgumentError: the samples do not have this field.
+        """
+        check_choice("field", field, [name for name in self.fields if name.endswith("labels")])
+        plain, channels = copy.copy(self), max(self.classes.names) + 1
+        plain.transform = None
+        plain.fields = (field, *({"known"} & set(self.fields) if field == "labels" else ()))
+        plain._grid_fields = replace(self._grid_fields, fields=frozenset(plain.fields))
+        counts = np.zeros((len(self), channels), np.int64)
+        for number in range(len(self)):
+            sample = cast(Values, plain[number])
+            labels = sample[field]
+            known = labels[sample.get("known", ...)].ravel()
+            counts[number] = np.bincount(known, minlength=channels)
+        return counts
 
     def __repr__(self) -> str:
         sizes = f"{count(len(self), 'frame')} in {count(len(self._parts), 'sequence')}"

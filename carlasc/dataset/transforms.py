@@ -282,7 +282,11 @@ def moved(
     with np.errstate(invalid="ignore"):  # of points that are not finite
         for name in {"points", "flow", "voxel_flow"} & made.keys():
             move = transform_points if name == "points" else rotate_vectors
-            made[name] = move(new_T_old, made[name]).astype(made[name].dtype)
+            old, linear = made[name], new_T_old[:3, :3]
+            if not new_T_old[:3, 3].any() and (linear == np.diag(linear.diagonal())).all():
+                made[name] = old * linear.diagonal().astype(old.dtype)  # a flip
+            else:
+                made[name] = move(new_T_old, old).astype(old.dtype)
     if "poses" in sample:
         made["poses"] = new_T_old @ sample["poses"] @ np.linalg.inv(new_T_old)
     if "cameras" in sample:

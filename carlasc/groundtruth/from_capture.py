@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from carlasc.captures.raw import Capture, SensorRecording, find_captures
+from carlasc.captures.raw import Capture, CaptureFiles, SensorRecording, find_captures
 from carlasc.core.arrays import AnyArray, FloatArray
 from carlasc.core.geometry import relative_to
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
@@ -18,7 +18,7 @@ from carlasc.groundtruth.voxel_actors import ActorPoints
 from carlasc.storage import layout
 from carlasc.storage.camera_files import cameras_to_json
 from carlasc.storage.files import AnyPath
-from carlasc.storage.inputs import FrameFiles, combined, digest_of_bytes
+from carlasc.storage.inputs import FrameFiles, combined
 from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import Source
 
@@ -122,7 +122,10 @@ class CaptureSequence(SequenceInput):
         self.path, self.location, self.metadata = (
             path,
             capture.location,
-            Metadata(classes=capture.classes),
+            Metadata(
+                classes=capture.classes,
+                extra={"simulated": True} if capture.is_simulated else {},
+            ),
         )
         self.capture, self.plan = capture, plan
 
@@ -207,25 +210,6 @@ class CaptureSequence(SequenceInput):
         elif asked.only is None:
             frames = f"{first}:{self.frames[-1].source_frame + 1}"
         return {"observe": "capture", "frames": frames, "sensors": len(self.capture.sensors)}
-
-
-class CaptureFiles(FrameFiles):
-    """The files of each frame of a capture."""
-
-    kind = "capture"
-
-    def __init__(self, capture: Capture) -> None:
-        self.capture, self.tree = capture, capture.tree
-
-    def paths(self, frame: int) -> list[str]:
-        """Return the files of all sensors and cameras."""
-        return self.capture.files_of(frame)
-
-    def contents(self, frame: int) -> Iterator[tuple[str, bytes]]:
-        """Yield the name and the digest of each file."""
-        paths = self.paths(frame)
-        for path, data in zip(paths, self.capture.tree.read_many(paths), strict=True):
-            yield path, digest_of_bytes(data)
 
 
 def capture_sequences(source: AnyPath | Source | Capture, plan: GridPlan) -> list[SequenceInput]:

@@ -1,5 +1,5 @@
 """The inputs of a run: sequences and their frames, and the plan that they share, for every source
-of grids.
+of grids; and whether they changed since an earlier run.
 
 A sequence has its frames, and the data that exist once per sequence. A frame is a small object that
 pickles into a worker process and is read there.
@@ -12,24 +12,32 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping
 from collections.abc import Sequence as Series
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, get_args
 
 from carlasc.core.arrays import AnyArray, FloatArray, IntArray, Uint8Array
+from carlasc.core.choices import CompareInputs
 from carlasc.core.frames import FrameRange
 from carlasc.core.grids import Grid, GridSpec
-from carlasc.core.tables import table_to_json
-from carlasc.errors import ArgumentError, CarlascError, MissingDataError
+from carlasc.errors import ArgumentError, CarlascError, MissingDataError, count
 from carlasc.groundtruth.options import FromGrid, FromScans, Observe, Voting
 from carlasc.groundtruth.reporting import PoseFacts, Residual
 from carlasc.groundtruth.voting.ballot import VoteRule, Votes
 from carlasc.groundtruth.voting.certainty import VoxelCertainty
 from carlasc.groundtruth.voxel_actors import VoxelActors
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.camera_files import cameras_of, scan_T_camera
-from carlasc.storage.inputs import FrameFiles, SequenceFiles
+from carlasc.storage.inputs import (
+    FrameFiles,
+    MadeFrom,
+    SequenceFiles,
+    combined,
+    content_digests,
+    describe_changes,
+    made_again,
+)
 from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import Sequence, SequenceWriter
 
@@ -254,7 +262,8 @@ class SequenceInput(ABC):
     def prepare(  # noqa: B027 (most sequences need nothing)
         self, writer: SequenceWriter | None, run: Run, steps: Callable[[int], None]
     ) -> None:
-        """Do the work that comes once per sequence, before its frames are made.
+        """Do the work that comes once per sequence, before its frames are made. A second call does
+        nothing.
 
         Args:
             writer: keeps the results beside the grids; None: they are not kept.
@@ -290,7 +299,7 @@ class SequenceInput(ABC):
 
     def shared(self) -> object:
         """Return what all frames depend on, besides the settings in params.json."""
-        return table_to_json(self.metadata.classes), self.cameras()
+        return self.metadata.classes.to_dict(), self.cameras()
 
     def available(self) -> Collection[int]:
         """Return the numbers of all frames that the source can have in the output."""
@@ -305,14 +314,6 @@ class SequenceInput(ABC):
             whole: digest of all of these and of `shared`.
         """
         return whole
-
-    def written(self, writer: SequenceWriter, grid: str) -> list[str]:
-        """Return the fields that a run wrote for each frame: those of the grid, and those of scans
-        unless they are the source.
-        """
-        fields = [f"{grid}/{part}" for part in layout.GRID_FIELDS]
-        is_copy = os.path.realpath(writer.location) != os.path.realpath(self.location)
-        return [*(layout.SCAN_FIELDS if is_copy else ()), *fields]
 
     def summaries(self) -> Series[Mapping[str, Any]] | None:
         """Return the facts of each actor, by number; None if actors are not tracked."""
@@ -359,6 +360,139 @@ class StoredSequence(SequenceInput):
         """Return the sequence's cameras.json; None if it has none."""
         has_cameras = layout.CAMERAS in self.sequence.documents()
         return self.sequence.read_document(layout.CAMERAS) if has_cameras else None
+
+
+@dataclass
+class InputCheck:
+    """The comparison of the inputs of one sequence with those that its grid was made from.
+
+    Attributes:
+        inputs: the sequence.
+        writer: the output.
+        grid: name of the grid.
+        compare: how files are compared.
+        stale: frames that exist and must be made again.
+        gone: frames of the output that the input has no longer.
+        changed: whether any input changed since the report was written.
+        must_record: whether the record must be written even if no frame is made.
+        notes: what was made again, and why, one line each.
+    """
+
+    inputs: SequenceInput
+    writer: SequenceWriter
+    grid: str
+    compare: CompareInputs
+    stale: set[int] = field(default_factory=set)
+    gone: set[int] = field(default_factory=set)
+    changed: bool = False
+    must_record: bool = False
+    notes: list[str] = field(default_factory=list)
+    _record: MadeFrom = field(default_factory=MadeFrom)
+    _own: dict[str, str] = field(default_factory=dict)
+    _whole: str = ""
+    _made: dict[int, str] = field(default_factory=dict)
+
+    @property
+    def _name(self) -> str:
+        return f"made-{self.grid}"
+
+    def look(
+        self, existing: Collection[int], agrees: Callable[[int], bool | None], run: Run
+    ) -> None:
+        """Find the frames that must be made again.
+
+        Args:
+            existing: frames that exist in the output.
+            agrees: makes a frame again, and returns whether the existing one is equal; None if it
+                cannot be made.
+            run: how the reading of files is spread.
+        """
+        inputs, files = self.inputs, self.inputs.files()
+        record = self._record = MadeFrom.read(self.writer, self._name)
+        if files is None or (self.compare == "never" and existing):
+            return
+        contents = content_digests(files, inputs.depended(), self.writer, self.compare, run)
+        inputs.take_contents(contents)
+        self._own = {
+            str(frame): combined(content, inputs.about(frame))
+            for frame, content in sorted(contents.items())
+        }
+        self._whole = combined(sorted(self._own.items()), inputs.shared())
+        self.changed = self.must_record = bool(record.frames) and self._whole != record.whole
+        recorded = {frame: record.frames.get(str(frame)) for frame in existing}
+        if not self.changed and all(recorded.values()):
+            return
+        inputs.prepare(self.writer, run, StepCounter(None))
+        self.gone = {int(frame) for frame in record.frames} - set(inputs.available())
+        self.stale = {
+            frame for frame, made in recorded.items() if made not in (None, self._made_from(frame))
+        }
+        if self.stale:
+            why = describe_changes(record.own, self._own)
+            if not why:
+                was_interrupted = "" in recorded.values()
+                why = "a run was interrupted" if was_interrupted else "what all scans share changed"
+            self.notes.append(f"{self.writer.location}: {made_again(self.stale, why)}")
+        if unknown := [frame for frame in sorted(existing) if recorded[frame] is None]:
+            self._accept(unknown, agrees)
+            self.must_record = True
+
+    def _made_from(self, frame: int) -> str:
+        if frame not in self._made:
+            self._made[frame] = self.inputs.made_from(frame, self._own, self._whole)
+        return self._made[frame]
+
+    def _accept(self, unknown: list[int], agrees: Callable[[int], bool | None]) -> None:
+        """Compare some frames without a record with what is made now."""
+        sample = {unknown[place] for place in (0, len(unknown) // 2, -1)}
+        equal = [agree for frame in sorted(sample) if (agree := agrees(frame)) is not None]
+        if not all(equal):
+            self.stale |= set(unknown)
+        what = "which are equal" if all(equal) else "which differ, so all are made again"
+        self.notes.append(
+            f"{self.writer.location}: {count(len(unknown), 'frame')} of {self.grid} without a "
+            f"record of what they were made from: {len(equal)} made again, {what}"
+        )
+
+    def begin(self, numbers: Collection[int], missing: Collection[int]) -> None:
+        """Write the record of the frames that are about to be made, and remove those of which
+        the input has no scan any more. The sequence is prepared.
+
+        Args:
+            numbers: all frames of the run.
+            missing: those that do not exist.
+        """
+        if not self._whole:
+            return
+        record, writer = self._record, self.writer
+        if self.gone:
+            is_copy = os.path.realpath(writer.location) != os.path.realpath(self.inputs.location)
+            written = [f"{self.grid}/{part}" for part in layout.GRID_FIELDS]
+            writer.remove_frames([*(layout.SCAN_FIELDS if is_copy else ()), *written], self.gone)
+        for frame in self.gone:
+            del record.frames[str(frame)]
+        record.frames |= {
+            str(frame): "" if frame in self.stale else self._made_from(frame)
+            for frame in sorted(numbers)
+            if frame in missing or frame in self.stale or str(frame) not in record.frames
+        }
+        # only a run that ends says that all frames and the report are of these inputs
+        record.own, record.whole = self._own, "" if self.changed or self.stale else self._whole
+        record.write(self.writer, self._name)
+
+    def finish(self, made: Collection[int]) -> None:
+        """Complete the record, after the frames and the report were written.
+
+        Args:
+            made: frames that were made.
+        """
+        if not self._whole:
+            return
+        record = MadeFrom.read(self.writer, self._name)  # other parts may have written it
+        again = self.stale & set(made)
+        record.frames |= {str(frame): self._made_from(frame) for frame in sorted(again)}
+        record.whole = self._whole
+        record.write(self.writer, self._name)
 
 
 def choose_frames(frames: FrameRange, available: IntArray, where: str) -> list[int]:

@@ -180,7 +180,8 @@ class GridOptions:
         observe: what observes the scene; None takes a capture if there is one, otherwise scans.
         voting: how votes are counted; None takes the default of `observe`.
         follow_ground: in a conversion, move the grid up or down by whole voxels where the ground is
-            below it, or far above its lower bound; False keeps the bounds of `spec`.
+            below it, or far above its lower bound, and make it smaller where points are near, as in
+            a room; False keeps the bounds of `spec`.
     """
 
     spec: GridSpec | None = None
@@ -192,6 +193,7 @@ class GridOptions:
 _BELOW = 0.05  # greatest share of ground points below a grid; fact: below-grid
 _LOW = 0.05  # quantile of the heights of ground points that a moved grid contains
 _SLACK_M = 0.6  # a grid that begins so far below the ground is moved up
+_SMALLEST = 4  # a grid becomes so many times smaller at most
 
 
 def share_below(ground: Ground, spec: GridSpec) -> float:
@@ -214,3 +216,28 @@ def fit_to_ground(spec: GridSpec, ground: Ground) -> GridSpec:
     # params.json has float32 bounds
     low, high = (float(np.float32(z + layers * size)) for z in (z0, z1))
     return replace(spec, lower=(x0, y0, low), upper=(x1, y1, high))
+
+
+def fit_to_reach(spec: GridSpec, reach_m: float) -> GridSpec:
+    """Return a grid of half or a quarter of the width if that still contains points up to
+    `reach_m`, metres, seen from above; else the grid itself.
+
+    The voxels of the published grid become as much smaller, and cubes, as of `--res`, keep their
+    size. Other grids do not change.
+    """
+    published, cubic = (
+        spec == GridSpec.published(),
+        np.allclose(spec.voxel_size[0], spec.voxel_size),
+    )
+    if spec.coordinates != "cartesian" or not (published or cubic):
+        return spec
+    scale = 1
+    while scale < _SMALLEST and 2 * scale * reach_m <= spec.upper[0]:
+        scale *= 2
+    if scale == 1:
+        return spec
+    (x0, y0, z0), (x1, y1, z1) = spec.lower, spec.upper
+    smaller = spec.with_bounds((x0 / scale, y0 / scale, z0), (x1 / scale, y1 / scale, z1))
+    if published:
+        return smaller.with_size((*spec.size[:2], spec.size[2] * scale))
+    return smaller.with_resolution(round(float(spec.voxel_size[0]), 6))

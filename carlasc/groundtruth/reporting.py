@@ -10,7 +10,6 @@ import platform
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from hashlib import blake2b
-from itertools import groupby
 from typing import Any, Self, TypedDict
 
 import numpy as np
@@ -20,7 +19,7 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, thin, transform_points
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.core.plain import from_plain
-from carlasc.errors import FormatError, carlasc_version, reading
+from carlasc.errors import FormatError, carlasc_version, reading, runs_of
 from carlasc.motion.refinement import RefinedPoses
 from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.inputs import digest_of, digest_of_bytes
@@ -551,7 +550,7 @@ class Report:
         if convergence is not None:
             measured = values["convergence"] | {"changed_share": convergence.changed_share}
             values["convergence"] = {"left_out": LEFT_OUT, **measured}
-        values["frames"] = _spans(self.frames)
+        values["frames"] = [(first, last + 1) for first, last in runs_of(self.frames)]
         values["inputs"] = {name: value for name, value in digests if not name.startswith(own)}
         values["outputs"] = {name: value for name, value in digests if name.startswith(own)}
         return {"format": REPORT_FORMAT} | {name: values[name] for name in _KINDS}
@@ -655,15 +654,6 @@ def _versions() -> dict[str, str]:
         "numba": numba.__version__,
         "python": platform.python_version(),
     }
-
-
-def _spans(frames: tuple[int, ...]) -> list[tuple[int, int]]:
-    """Return half-open ranges of consecutive frame numbers."""
-    runs = [
-        [frame for _, frame in run]
-        for _, run in groupby(enumerate(frames), lambda pair: pair[1] - pair[0])
-    ]
-    return [(run[0], run[-1] + 1) for run in runs]
 
 
 def _frames(spans: tuple[tuple[int, int], ...]) -> tuple[int, ...]:

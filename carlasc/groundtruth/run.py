@@ -22,7 +22,7 @@ import numpy as np
 from carlasc.captures.raw import RAW, Capture, find_captures
 from carlasc.core.arrays import AnyArray
 from carlasc.core.choices import CompareInputs
-from carlasc.core.classes import ClassTable
+from carlasc.core.classes import ClassTable, TableUse
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import Grid, GridSpec, is_confident
 from carlasc.errors import (
@@ -36,11 +36,17 @@ from carlasc.errors import (
     check_types,
     reading,
 )
-from carlasc.groundtruth.comparing import InputCheck
 from carlasc.groundtruth.from_capture import capture_sequences
 from carlasc.groundtruth.from_grid import resampled_sequences
 from carlasc.groundtruth.from_scans.sequences import scan_sequences
-from carlasc.groundtruth.inputs import FrameData, FrameInput, GridPlan, SequenceInput
+from carlasc.groundtruth.inputs import (
+    FrameData,
+    FrameInput,
+    GridPlan,
+    InputCheck,
+    SequenceInput,
+    StoredSequence,
+)
 from carlasc.groundtruth.options import FromCapture, FromScans, Observe, Voting
 from carlasc.groundtruth.reporting import Changes, FrameFacts, Report, sample_frames
 from carlasc.groundtruth.seen import check_views, see_voxels
@@ -81,6 +87,7 @@ class RegridResult:
         failures: frames that could not be made.
         elapsed_s: duration of the run, in seconds.
         notes: remarks about how the grids were made, one line each.
+        source_classes: class tables by which sequences were read, and what named them.
     """
 
     grids: tuple[str, ...]
@@ -90,6 +97,7 @@ class RegridResult:
     failures: tuple[FrameFailure, ...]
     elapsed_s: float
     notes: tuple[str, ...] = ()
+    source_classes: tuple[TableUse, ...] = ()
 
 
 def regrid(
@@ -181,10 +189,10 @@ def regrid(
 
     grids = tuple(sink.place(f"{job.path}/{grid}") for job in jobs)
     notes = tuple(note for job in jobs for note in (*job.check.notes, *job.inputs.notes()))
-    made = work.wanted - len(failures)
-    return RegridResult(
-        grids, spec, made, work.skipped, tuple(failures), time.perf_counter() - start, notes
-    )
+    made, took = work.wanted - len(failures), time.perf_counter() - start
+    stored = [job.inputs.sequence for job in jobs if isinstance(job.inputs, StoredSequence)]
+    uses = tuple(sorted({sequence.table_use() for sequence in stored}))
+    return RegridResult(grids, spec, made, work.skipped, tuple(failures), took, notes, uses)
 
 
 def _choose(source: AnyPath | Source | Capture) -> Observe:
@@ -596,7 +604,7 @@ class SequenceJob:
                 self.plan,
                 inputs.metadata.classes,
                 number in sampled,
-                number in self.check.replaced,
+                number in self.check.stale,
                 existing,
             )
             for number in sorted(numbers)
@@ -666,7 +674,7 @@ class Work:
         def batches() -> Iterator[Batch]:
             for job, todo, missing in zip(self.jobs, every, ours, strict=True):
                 if missing:
-                    job.check.prepare(self.spread, steps)
+                    job.inputs.prepare(job.writer, self.spread, steps)
                     job.check.begin(job.numbers, todo)
                 for batch in _batches(job, job.tasks(missing)):
                     under_way.append(job)
@@ -709,13 +717,14 @@ class Work:
         is_reported &= not made and not job.check.changed
         if not (is_reported or (self.spread.part.count > 1 and job.missing())):
             self._report(job, made, tried)
+        if job.check.must_record and not made:
+            job.check.begin(job.numbers, ())
         if made or job.check.must_record:
-            job.check.begin(job.numbers, ())  # if no frame was made
             job.check.finish({done.task.number for done in made if done.error is None})
 
     def _report(self, job: SequenceJob, made: list[FrameResult], tried: Set[int]) -> None:
         """Write the report of a sequence."""
-        job.check.prepare(self.spread, StepCounter(None))
+        job.inputs.prepare(job.writer, self.spread, StepCounter(None))
         self.has_written = True
         measured = _batches(job, job.tasks(job.reported - tried, job.writer))
         with closing(run_all(run_batch, measured, self.spread, lost=fail_batch)) as results:

@@ -11,6 +11,7 @@ axis, for instance, changes nothing on a straight road.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -19,16 +20,20 @@ from typing import TypeAlias
 import numpy as np
 
 from carlasc.core.arrays import AnyArray, AnyFloatArray, BoolArray, FloatArray
+from carlasc.core.cells import warped_voxels
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, choices_of_axes, invert, transform_points, translation
 from carlasc.core.grids import GridSpec
 from carlasc.errors import CarlascError
-from carlasc.inspection.points_in_voxels import warped_voxels
 from carlasc.inspection.pose_quality import PoseQuality, angles_of, measure_poses
+from carlasc.motion.joint_alignment import blocks, spread_of
+from carlasc.motion.solving import principal_axes
 from carlasc.storage.protocol import Sequence
 
 MIN_RANGE_M = 3.0
 MAX_RANGE_M = 30.0
+_INDOORS_M, _NEAR_M = 1.0, 5.0  # nearest points indoors: where half of them are so near
+_STANDS_M_S = 0.1  # slower points stand
 _COLUMN_M = 0.4
 _UPRIGHT_M = 0.6  # points in a column that spans less height are ground
 _FOOT_M = 0.3  # lowest part of an upright column, which counts as ground
@@ -80,7 +85,8 @@ def structure_of(
     Returns:
         (M, 3) float64 points, metres, in the frame of the sensor.
     """
-    keep = within(points, MIN_RANGE_M, MAX_RANGE_M)
+    indoors = np.mean(within(points, 0.0, _NEAR_M)) > 0.5
+    keep = within(points, _INDOORS_M if indoors else MIN_RANGE_M, MAX_RANGE_M)
     if labels is not None and bool(labels.any()):
         keep &= _static_classes(classes)[
             # packed stores keep labels in uint8
@@ -89,7 +95,7 @@ def structure_of(
     else:
         keep[keep] = _is_upright(points[keep])
     if flow is not None:
-        keep &= (np.abs(flow) < 0.1).all(axis=1)
+        keep &= (np.abs(flow) < _STANDS_M_S).all(axis=1)
     return points[np.flatnonzero(keep)].astype(np.float64)
 
 
@@ -295,6 +301,95 @@ def diagnose_poses(
     search = not explained and own < _GOOD
     offset = _common_offset(overlaps) if search else None
     return PoseDiagnosis(own, len(overlaps), quality=quality, offset_m=offset)
+
+
+REACH_M = 3.0
+"""Scans within this distance of each other overlap, however much time is between them."""
+_LONG_PAIRS = 12
+# Scans over this distance overlap by at least a share, or by as much of the share of neighbours:
+# where a motion is missing in the poses, they do not.
+_LEAST, _ALIKE, _ENOUGH = 0.25, 0.62, 0.5
+# surfaces of one scan: size of the cells, least points, thickness, flatness, width
+_WALL_M, _WALL_POINTS, _THIN_M2, _FLAT, _WIDE_M2 = 1.0, 12, 0.06**2, 0.02, 0.02
+# A position is determined where scans overlap less if they are moved by these distances: by any
+# factor where this share of the surfaces faces the direction, else by a factor; by a larger one
+# where the sensor stands, as the rays of a scan then end where those of the scan before ended.
+_SHIFTS_M = VOXEL_M * np.array([-4, -3, -2, -1, 1, 2, 3, 4])
+_FACING, _MOVED, _STOOD = 0.012, 1.05, 1.25
+
+
+@dataclass(frozen=True)
+class LongOverlap:
+    """Whether the poses hold over some metres, however long the sensor takes for them.
+
+    Attributes:
+        share: mean share of a scan's structure that falls on that of the last scan within
+            `REACH_M`; NaN if no scans have enough structure.
+        open_way: (2,) horizontal direction in the frame of the first scan, along which scans
+            overlap as well at other positions, as along a tunnel; None if there is none.
+    """
+
+    share: float
+    open_way: FloatArray | None = None
+
+    def is_wrong(self, near: float) -> bool:
+        """Return whether a motion is missing: `near` is the share of neighbouring scans."""
+        return self.share < max(_LEAST, min(_ENOUGH, _ALIKE * near))
+
+    @property
+    def why_untested(self) -> str:
+        """Why the motion could not be tested; empty if it was."""
+        if self.open_way is not None:
+            x, y = self.open_way
+            return (
+                f"scans overlap as well when they are moved along (x, y) = ({x:.1f}, {y:.1f}) in "
+                "the frame of the first scan: no surface determines the position there, or the "
+                "poses are wrong"
+            )
+        return "" if self.share >= 0 else "scans have too few upright things"
+
+
+def measure_overlap(structure: Callable[[int], FloatArray], poses: Poses) -> LongOverlap:
+    """Measure the overlap of scans that are near each other under their poses but far in time, and
+    whether it determines their positions.
+
+    Args:
+        structure: returns the (M, 3) structure of the i-th scan.
+        poses: (F, 4, 4) first_T_sensor of each scan, in order of time; rigid.
+    """
+    pairs, facing = [], np.zeros((2, 2))
+    for first in np.unique(np.linspace(0, len(poses) - 2, _LONG_PAIRS).astype(int)).tolist():
+        away = np.linalg.norm(poses[first:, :3, 3] - poses[first, :3, 3], axis=1) > REACH_M
+        last = first + int(away.argmax()) if away.any() else len(poses) - 1
+        target, moved = structure(first), _thin(structure(last), _OFFSET_POINTS)
+        if min(len(target), len(moved)) < _MIN_POINTS:
+            continue
+        here, motion = poses[first : first + 1], relative(poses, first, last)
+        pairs.append((occupancy(target), motion, moved, here[0, :2, :3]))
+        (block,) = blocks([target.astype(np.float32)], here, _WALL_M, shift=0.0)
+        _, spread = spread_of(block, here, 1)
+        values, vectors = principal_axes(spread[block.sums[:, 0] >= _WALL_POINTS])
+        thin, wide, _ = values.T
+        flat = (thin < np.minimum(_FLAT * wide, _THIN_M2)) & (wide > _WIDE_M2)
+        normals = vectors[flat][:, :2, 0]
+        facing += normals.T @ normals
+    if not pairs:
+        return LongOverlap(math.nan)
+    ways, directions = np.linalg.eigh(facing)
+    way, shares, along = directions[:, 0], [], []
+    for occupied, motion, moved, first_T_here in pairs:
+        step = way @ first_T_here
+        shares.append(
+            [
+                overlap(occupied, translation(shift * step) @ motion, moved)
+                for shift in (0.0, *_SHIFTS_M)
+            ]
+        )
+        along.append(abs(step @ motion[:3, 3]))
+    own, *others = np.mean(shares, axis=0).tolist()
+    faced = ways[0] > _FACING * ways.sum()
+    needed = 1.0 if faced else _MOVED if np.median(along) > VOXEL_M else _STOOD
+    return LongOverlap(own, way if own < needed * max(others) else None)
 
 
 def choose_pairs(poses: Poses, max_pairs: int) -> list[tuple[int, int]]:

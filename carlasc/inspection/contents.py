@@ -339,15 +339,10 @@ def _others(
 
 
 def _check_classes(labels: AnyIntArray, classes: ClassTable, where: str) -> Iterator[Finding]:
-    known = np.zeros(classes.num_channels, np.bool_)
-    known[list(classes.names)] = True
-    if (labels < len(known)).all() and known[labels].all():
-        return
-    numbers = zip(*np.unique(labels, return_counts=True), strict=True)
-    unknown = [f"{i} ({n} times)" for i, n in numbers if i not in classes.names]
-    found = ", ".join(unknown[:5]) + (" and more" if len(unknown) > 5 else "")
-    advice = f"correct the file, or the classes in {layout.METADATA}"
-    yield Finding("error", "class-ids", where, f"class ids of {classes.name}", found, advice)
+    if unknown := [f"{i} ({n} times)" for i, n in classes.unknown(labels).items()]:
+        found = ", ".join(unknown[:5]) + (" and more" if len(unknown) > 5 else "")
+        advice = f"correct the file, or the classes in {layout.METADATA}"
+        yield Finding("error", "class-ids", where, f"class ids of {classes.name}", found, advice)
 
 
 def _first_of(frames: set[int]) -> str:

@@ -10,6 +10,15 @@ from carlasc.errors import CarlascError
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")  # worst first
+State = Literal["right", "wrong", "untested", "accepted"]
+Verdict = Literal["sound", "not sound", "undetermined"]
+STATES = {
+    "right": "tested and right",
+    "wrong": "tested and wrong",
+    "untested": "could not be tested",
+    "accepted": "accepted",
+}
+"""What can be said of a check that a grid needs, in words."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +35,7 @@ class Finding:
         found: the content that it has.
         advice: what to do; may be empty.
         sequence: path of the sequence in its Source; `validate` fills it in.
+        tested: False if the check could not be made; `found` says why.
     """
 
     severity: Severity
@@ -35,6 +45,7 @@ class Finding:
     found: str
     advice: str = ""
     sequence: str = ""
+    tested: bool = True
 
     @classmethod
     def from_error(
@@ -78,10 +89,11 @@ class SequenceReport:
             poses, metres; None if it is undetermined.
         refined_m: the same distance under refined poses.
         mounting: x, y, z, roll, pitch and yaw of the sensor in the frame of the poses, and the
-            delay of the poses, each with its standard error, or "undetermined"; empty if none could
+            delay of the poses, each with its interval, or "undetermined"; empty if none could
             be measured.
         images: by camera, the shift of its images against the scans, in pixels, and their delay, or
             "undetermined"; empty without images.
+        checks: by check that a grid needs, "right", "wrong", "untested" or "accepted".
     """
 
     path: str
@@ -93,6 +105,7 @@ class SequenceReport:
     refined_m: float | None = None
     mounting: Mapping[str, str] = field(default_factory=dict)
     images: Mapping[str, str] = field(default_factory=dict)
+    checks: Mapping[str, State] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -110,9 +123,21 @@ class ValidationResult:
     sequences: tuple[SequenceReport, ...]
 
     @property
+    def verdict(self) -> Verdict:
+        """Whether the data are sound: there may be warnings of checks that no grid needs.
+
+        They are "not sound" if there is an error, or a check that a grid needs is wrong, and
+        "undetermined" if such a check could not be made.
+        """
+        states = {state for report in self.sequences for state in report.checks.values()}
+        if self.count("error") or "wrong" in states:
+            return "not sound"
+        return "undetermined" if "untested" in states else "sound"
+
+    @property
     def ok(self) -> bool:
-        """Whether there is no error; there may be warnings and notes."""
-        return self.count("error") == 0
+        """Whether the verdict is "sound"."""
+        return self.verdict == "sound"
 
     def count(self, severity: Severity) -> int:
         """Return the number of findings of a severity."""
@@ -132,6 +157,7 @@ class ValidationResult:
         return {
             "location": self.location,
             "ok": self.ok,
+            "verdict": self.verdict,
             "counts": {severity: self.count(severity) for severity in SEVERITIES},
             "findings": [asdict(finding) for finding in self.findings],
             "sequences": [asdict(report) for report in self.sequences],

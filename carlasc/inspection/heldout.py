@@ -28,16 +28,20 @@ from carlasc.groundtruth.from_scans.sequences import (
     scan_sequences,
 )
 from carlasc.groundtruth.inputs import GridPlan
+from carlasc.inspection.findings import State
 from carlasc.inspection.heldout_scores import HeldOutScores
+from carlasc.motion.options import PoseOptions
 from carlasc.motion.tracks import MovingActors
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
-from carlasc.storage import layout
+from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath
 from carlasc.storage.protocol import Sequence, Source
 
 EVERY = 10
 """Default of `every`: every tenth scan is left out."""
+_FREE, _PASSED, _SWEPT = 0.02, 0.35, 0.25  # greatest shares of grids that are right
+_RETURNS = 1000  # fewer returns within the grid tell nothing
 # a frame is measured if its window has this share of the scans of a whole window
 _NEARLY_WHOLE = 0.8
 
@@ -72,11 +76,44 @@ class HoldoutResult:
             return None
         return reduce(HeldOutScores.merge, scores)
 
+    @property
+    def faults(self) -> dict[str, str]:
+        """What is wrong with the grids of each sequence, in words: see docs/commands/validate.md.
+
+        It is empty for a grid that is right, and one of another sequence is left out if it could
+        not be tested.
+        """
+        found = {}
+        for path, scores in self.sequences.items():
+            rays = scores.all
+            limits = (
+                (rays.free, _FREE, "of the returns are in voxels called free"),
+                (rays.passed_object, _PASSED, "of the rays pass through objects"),
+                (scores.swept_share, _SWEPT, "of what the vehicle drove through is occupied"),
+            )
+            if rays.returns >= _RETURNS:
+                found[path] = ", ".join(
+                    f"{share:.1%} {what} (at most {most:.0%} is right)"
+                    for share, most, what in limits
+                    if share is not None and share > most
+                )
+        return found
+
+    @property
+    def state(self) -> State:
+        """What the rays say: "untested" if too few of them return from the grids of a sequence."""
+        faults = self.faults
+        if any(faults.values()):
+            return "wrong"
+        return "right" if len(faults) == len(self.sequences) else "untested"
+
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain values for JSON."""
         total = self.total
         return {
             "location": self.location,
+            "state": self.state,
+            "faults": self.faults,
             "grid": asdict(self.spec),
             "every": self.every,
             "total": None if total is None else total.to_dict(),
@@ -91,7 +128,7 @@ def holdout(
     source: AnyPath | Source,
     spec: GridSpec | None = None,
     *,
-    observe: FromScans = FromScans(),  # noqa: B008 (frozen)
+    observe: FromScans | None = None,
     voting: Voting = Voting(),  # noqa: B008 (frozen)
     every: int = EVERY,
     frames: Frames = None,
@@ -109,8 +146,10 @@ def holdout(
     Args:
         source: anything that `carlasc.open` takes; its sequences have scans and poses, labels or
             not.
-        spec: geometry of the grids, Cartesian; None for the published one.
-        observe: how scans are merged.
+        spec: geometry of the grids, Cartesian; None for that of the grid that exists, or the
+            published one.
+        observe: how scans are merged; None for what the record of the grid that exists says, or the
+            defaults, under the given poses.
         voting: how votes are counted.
         every: leave out every N-th scan.
         frames: range of the frames that may be left out; None for all.
@@ -121,7 +160,9 @@ def holdout(
         MissingDataError: there is no sequence with scans, no poses, or no frame.
         FormatError: poses or times are not valid.
     """
-    start, spec = time.perf_counter(), spec or GridSpec.published()
+    start = time.perf_counter()
+    existing, made = _existing_grid(as_source(source))
+    spec, observe = spec or existing, observe or made
     if every < 2:
         raise ArgumentError("every", expected="2 or more", found=str(every))
     if spec.coordinates != "cartesian":
@@ -165,6 +206,24 @@ def holdout(
     return HoldoutResult(
         location, spec, every, scores, tuple(failures), time.perf_counter() - start, before
     )
+
+
+def _existing_grid(source: Source) -> tuple[GridSpec, FromScans]:
+    """Return the geometry of the first Cartesian grid of a data set, and how it was made; the
+    published one without any.
+    """
+    poses = PoseOptions("file")
+    for sequence in source.sequences().values():
+        for name, spec in sequence.grids.items():
+            if spec.coordinates == "cartesian" and sequence.predicted_by(name) is None:
+                record = sequence.params(name).get("carlasc", {})
+                if record.get("observe") != "scans":
+                    return spec, FromScans(poses=poses)
+                names = ("dynamic", "complete", "own_path", "stride", "window_m")
+                made = {key: record[key] for key in names if key in record}
+                first, _, last = record["window"].partition(":")
+                return spec, FromScans((int(first), int(last)), poses=poses, **made)
+    return GridSpec.published(), FromScans(poses=poses)
 
 
 @dataclass(frozen=True)

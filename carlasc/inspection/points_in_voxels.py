@@ -9,8 +9,7 @@ import math
 import numpy as np
 
 from carlasc.core.arrays import AnyFloatArray, AnyIntArray, BoolArray, FloatArray, IntArray
-from carlasc.core.cells import Cells, find_voxel
-from carlasc.core.compiling import cached
+from carlasc.core.cells import warped_voxels
 from carlasc.core.grids import GridSpec
 
 UNKNOWN, OUTSIDE = -1, -2
@@ -53,18 +52,6 @@ def labels_at(
     return values[warped_voxels(exact, spec, warps, later_s)]
 
 
-def warped_voxels(
-    points: FloatArray, spec: GridSpec, warps: FloatArray, later_s: float = 0.0
-) -> IntArray:
-    """Return (W, N) voxels of points under maps, as in `labels_at`; outside, the number of voxels.
-
-    It is compiled, because many maps are tried on the same points.
-    """
-    voxels = np.empty((len(warps), len(points)), np.int64)
-    _find(points, np.ascontiguousarray(warps), later_s, Cells.of(spec), voxels)
-    return voxels
-
-
 def _shifted(voxels: IntArray, spec: GridSpec, shifts: IntArray) -> IntArray:
     """Return (S, N) the voxels that are some cells away from (N,) voxels."""
     cells = np.stack(np.unravel_index(np.maximum(voxels, 0), spec.size), axis=-1)
@@ -74,17 +61,3 @@ def _shifted(voxels: IntArray, spec: GridSpec, shifts: IntArray) -> IntArray:
     inside = (voxels >= 0) & ((moved >= 0) & (moved < spec.size)).all(axis=2)
     flat = np.ravel_multi_index(tuple(np.moveaxis(moved, 2, 0)), spec.size, mode="clip")
     return np.where(inside, flat, voxels)
-
-
-@cached
-def _find(points, maps, later_s, cells, voxels):  # type: ignore[no-untyped-def]
-    for w in range(len(maps)):
-        m = maps[w]
-        for i in range(len(points)):
-            x, y, z = points[i, 0], points[i, 1], points[i, 2]
-            voxels[w, i] = find_voxel(
-                m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3] + m[0, 4] * later_s,
-                m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3] + m[1, 4] * later_s,
-                m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] + m[2, 4] * later_s,
-                cells,
-            )

@@ -78,10 +78,10 @@ def measure_poses(
     numbers = np.arange(len(poses), dtype=np.float64)
     for first in _choose_runs(poses, times):
         rows = slice(first, first + _RUN)
-        scans = [
-            ThinnedScan.of(points(row).astype(np.float32), poses[row])
-            for row in range(len(poses))[rows]
-        ]
+        scans = list[ThinnedScan]()
+        for row in range(len(poses))[rows]:  # in Python 3.11, a comprehension is a level of calls
+            thinned = ThinnedScan.of(points(row).astype(np.float32), poses[row])
+            scans.append(thinned)
         used, measured = [scan.used for scan in scans], [scan.measured for scan in scans]
         was = finite_mean(disagreement(measured, poses[rows]))
         aligned = align(used, poses[rows], poses[rows])
@@ -112,26 +112,28 @@ def describe_mounting(mounting: Mounting) -> tuple[str, str] | None:
     """
     wrong, values, errors = mounting.wrong, mounting.values, mounting.errors
     described, advice = [], "write corrected poses with `carlasc refine`"
-    if wrong[:6].any():
+    if wrong[:3].any():
         place = ", ".join(
             f"{axis} = {values[i]:.2f} ± {errors[i]:.2f} m"
             if mounting.determined[i]
             else f"{axis} undetermined"
             for i, axis in enumerate("xyz")
         )
-        turned = " and ".join(
-            f"{name} {np.rad2deg(values[i]):.1f} degrees"
-            for i, name in enumerate(("roll", "pitch", "yaw"), 3)
-            if wrong[i]
-        )
         described.append(
             f"poses of another point of the vehicle: in their frame, the sensor is at about {place}"
-            + (f", turned by {turned}" if turned else "")
         )
         advice = (
             "write the poses of the sensor: inv(T) @ P @ T, with T the sensor's pose in the frame "
             f"of the poses (from the calibration), or {advice}"
         )
+    if wrong[3:6].any():
+        turned = " and ".join(
+            f"{name} {np.rad2deg(values[i]):.1f} ± {np.rad2deg(errors[i]):.1f} degrees"
+            for i, name in enumerate(("roll", "pitch", "yaw"), 3)
+            if wrong[i]
+        )
+        described.append(f"poses in whose frame the sensor is turned by {turned}")
+        advice = f"check the rotation of the calibration, which no command changes; {advice}"
     if wrong[6]:
         when, late_s = "late" if values[6] > 0 else "early", abs(values[6])
         described.append(

@@ -148,7 +148,7 @@ class _ReportMaker:
     def __init__(self, sequence: Sequence, grid: str) -> None:
         self.sequence, self.grid = sequence, grid
         self.frames: list[int] = sequence.frames(f"{grid}/labels").tolist()
-        self.inputs = _inputs_of(sequence, grid)
+        self.inputs = inputs_of(sequence, grid)
 
     @property
     def steps(self) -> int:
@@ -211,7 +211,7 @@ class _ReportMaker:
         return {**result.total.to_dict(), **({"given_poses": given[0]} if given else {})}
 
 
-def _inputs_of(sequence: Sequence, grid: str) -> ScanSequence | None:
+def inputs_of(sequence: Sequence, grid: str) -> ScanSequence | None:
     """Return the scans that a grid was made from; None if they are not in the same sequence."""
     record = sequence.params(grid).get(RECORD)
     if not isinstance(record, dict) or "points" not in sequence.fields():
@@ -221,7 +221,11 @@ def _inputs_of(sequence: Sequence, grid: str) -> ScanSequence | None:
         if known.get("observe") != "scans":
             return None
         options = _options_of(known)
-        voting = Voting(known.get("voting"), float(known.get("free_step_m", Voting().free_step_m)))
+        voting = Voting(
+            known.get("voting"),
+            float(known.get("free_step_m", Voting().free_step_m)),
+            min_confidence=float(known.get("min_confidence", 0.0)),
+        )
         plan = GridPlan(sequence.grids[grid], grid, options, voting, FrameRange.of(None))
         inputs = ScanSequence(sequence, plan, options)
         return inputs if len(inputs.feed.frames) else None

@@ -6,11 +6,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from carlasc.captures.raw import RAW, Capture
+import numpy as np
+
+from carlasc.captures.raw import RAW, Capture, CaptureFiles
 from carlasc.core.frames import FrameRange
 from carlasc.errors import CarlascError
-from carlasc.groundtruth.from_capture import CaptureFiles
-from carlasc.inspection.findings import Finding
+from carlasc.inspection.findings import Finding, Severity
+from carlasc.running.spreading import Run
 from carlasc.storage.folder import FolderSequence
 from carlasc.storage.inputs import (
     FrameFiles,
@@ -22,6 +24,7 @@ from carlasc.storage.inputs import (
 )
 from carlasc.storage.protocol import Sequence, SequenceWriter
 
+_SEED = 0
 _ADVICE = "make the grid again with the command that made it: it makes what changed again"
 
 
@@ -54,6 +57,40 @@ def check_inputs(sequence: Sequence) -> Iterator[Finding]:
         if changes := changed_inputs(sequence, grid):
             where = f"{sequence.location}/{grid}"
             yield Finding("warning", "inputs", where, "what it was made from", changes, _ADVICE)
+
+
+def check_sample(sequence: Sequence, count: int, run: Run) -> Iterator[Finding]:
+    """Make some frames of each grid again from the scans beside it, and yield a finding for each
+    grid with a frame that differs, and a note for each that was compared.
+    """
+    from carlasc.groundtruth.run import FrameTask  # compiled code, which `info` does not need
+    from carlasc.inspection.reports import inputs_of
+
+    for grid in sequence.grids:
+        inputs, where = inputs_of(sequence, grid), f"{sequence.location}/{grid}"
+        frames = sequence.frames(f"{grid}/labels")
+        if inputs is None or not len(frames):
+            continue
+        chosen = np.random.default_rng(_SEED).permutation(frames)[:count].tolist()
+        different = list[int]()
+        try:
+            inputs.prepare(None, run, lambda steps: None)
+            for number in sorted(chosen):
+                frame = inputs.frame(number)
+                task = FrameTask(number, frame, inputs.plan, inputs.metadata.classes, False)
+                made = task.run().outputs.get(f"{grid}/labels")
+                there = sequence.read(f"{grid}/labels", number)
+                if made is None or not np.array_equal(made.reshape(-1), there.reshape(-1)):
+                    different.append(number)
+        except CarlascError as error:
+            yield Finding.from_error("inputs", where, error, _ADVICE)
+            continue
+        found = f"{len(different)} of {len(chosen)} frames that differ (seed {_SEED})"
+        if different:
+            found = f"{found}, the first is {different[0]}"
+        kind: Severity = "warning" if different else "note"
+        expected, advice = "what is made of the scans now", _ADVICE if different else ""
+        yield Finding(kind, "inputs", where, expected, found, advice)
 
 
 def changed_inputs(sequence: Sequence, grid: str) -> str:

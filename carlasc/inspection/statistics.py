@@ -19,7 +19,7 @@ from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingData
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
-from carlasc.storage.class_files import read_remap
+from carlasc.storage.class_files import read_classes, read_remap
 from carlasc.storage.files import AnyPath
 from carlasc.storage.layout import EVALUATION
 from carlasc.storage.protocol import Sequence, Source
@@ -196,6 +196,7 @@ def stats(
     grid: str = EVALUATION,
     remap: str | Remap | None = "auto",
     every: int = 1,
+    source_classes: ClassTable | AnyPath | None = None,
     allow_unknown: bool = False,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> Statistics:
@@ -208,6 +209,8 @@ def stats(
             of classes with a map, None for no second table, or "auto", which takes the paper's 11
             classes or SemanticKITTI's 19.
         every: count only every N-th frame.
+        source_classes: class table of the labels, if the metadata do not name it: a table, its
+            name, or a JSON or YAML file. None: that of the metadata.
         allow_unknown: count points and voxels whose id is no class apart, instead of listing their
             frames as failures.
         run: how the work is spread, with a callback for progress.
@@ -225,6 +228,9 @@ def stats(
         raise ArgumentError("every", expected="1 or more", found=str(every))
     opened = as_source(source)
     sequences = opened.sequences()
+    if source_classes is not None:
+        given = read_classes(source_classes, "source_classes")[0]
+        sequences = {path: one.with_classes(given) for path, one in sequences.items()}
     tasks = [task for sequence in sequences.values() for task in _tasks(sequence, grid, every)]
     if not tasks:
         expected, advice = f"labels of points or the grid {grid}", "name another grid with `grid`"

@@ -4,14 +4,15 @@ grid are unchanged since its report.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
+from typing import Any
 
 import numpy as np
 
-from carlasc.core.arrays import Float32Array, FloatArray, LabelArray
+from carlasc.core.arrays import Float32Array, LabelArray
 from carlasc.core.geometry import check_rigid
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, CarlascError, check_types
@@ -19,7 +20,14 @@ from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.reporting import Report, short
 from carlasc.inspection.agreement import GridDiagnosis, GridEvidence, GroundBelow, check_actors
-from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses, static_structure
+from carlasc.inspection.alignment import (
+    REACH_M,
+    LongOverlap,
+    PoseDiagnosis,
+    diagnose_poses,
+    measure_overlap,
+    static_structure,
+)
 from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values
 from carlasc.inspection.findings import (
     SEVERITIES,
@@ -30,7 +38,15 @@ from carlasc.inspection.findings import (
 )
 from carlasc.inspection.image_alignment import compare_images, judge_images
 from carlasc.inspection.pose_quality import check_poses, check_times, describe_mounting
-from carlasc.inspection.staleness import check_inputs
+from carlasc.inspection.soundness import (
+    CHECKS,
+    OVERLAP,
+    ScanFacts,
+    judge,
+    record_accepted,
+    untested,
+)
+from carlasc.inspection.staleness import check_inputs, check_sample
 from carlasc.motion.ground import ground_of
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
@@ -125,6 +141,8 @@ def validate(
     source: AnyPath | Source,
     *,
     every: int | None = None,
+    accept: Collection[str] = (),
+    sample: int = 0,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> ValidationResult:
     """Check a data set: files against each other, values, poses, times, and scans against poses and
@@ -138,20 +156,25 @@ def validate(
         source: a path or URL that `carlasc.open` knows, or a Source.
         every: read the contents of every N-th frame; 1 reads all. None: about forty frames per
             sequence.
+        accept: checks whose warnings are true of the place, as in a tunnel: carlasc.json of the
+            sequence then says so.
+        sample: number of frames of each grid that are made again from the scans beside it and
+            compared.
         run: how the work is spread over the sequences, with a callback for progress.
 
     Returns:
-        The findings; `ok` is True if none of them is an error.
+        The findings, and the verdict.
 
     Raises:
-        ArgumentError: `every` is less than 1.
+        ArgumentError: `every` is less than 1, no check has the name of an accepted one, or the data
+            are not in a folder, so that they cannot say what was accepted.
         MissingDataError: there is no data set.
     """
     check_types(validate, locals())
     if every is not None and every < 1:
         raise ArgumentError("every", expected="1 or more", found=str(every))
     opened = as_source(source)
-    plans = [_plan(sequence, every) for sequence in opened.sequences().values()]
+    plans = [_plan(sequence, every, accept) for sequence in opened.sequences().values()]
     step = StepCounter(run.progress, sum(plan.steps for plan in plans))
     findings: list[Finding] = []
     reports = []
@@ -161,10 +184,16 @@ def validate(
         examined = run_all(_examine, plans, run, lost=_fail)
     for plan, (in_sequence, report) in zip(plans, examined, strict=True):
         named = [replace(finding, sequence=plan.sequence.path) for finding in in_sequence]
+        if sample > 0:
+            path, more = plan.sequence.path, check_sample(plan.sequence, sample, run)
+            named += [replace(finding, sequence=path) for finding in more]
         findings += sorted(named, key=lambda finding: SEVERITIES.index(finding.severity))
         reports.append(report)
         if not run.is_alone:
             step(plan.steps)
+    if unknown := sorted({*accept} - {*CHECKS} - {finding.check for finding in findings}):
+        raise ArgumentError("accept", expected=f"checks, such as {OVERLAP}", found=unknown[0])
+    record_accepted(opened, findings, accept)
     return ValidationResult(opened.location, tuple(findings), tuple(reports))
 
 
@@ -176,13 +205,14 @@ class _CheckedFrames:
     frames: tuple[int, ...]  # the frames of any field
     opened: tuple[int, ...]  # the frames whose files are opened to check their sizes
     read: tuple[int, ...]  # the frames whose contents are read
+    accept: Collection[str]  # checks whose warnings are accepted
 
     @property
     def steps(self) -> int:
         return len(self.opened) + len(self.read) + 1
 
 
-def _plan(sequence: Sequence, every: int | None) -> _CheckedFrames:
+def _plan(sequence: Sequence, every: int | None, accept: Collection[str]) -> _CheckedFrames:
     numbers = set[int]()
     with suppress(CarlascError):  # which is reported when the sequence is examined
         numbers.update(*(sequence.frames(name).tolist() for name in sequence.fields()))
@@ -191,7 +221,7 @@ def _plan(sequence: Sequence, every: int | None) -> _CheckedFrames:
     # opening a local file is cheap; a frame of a packed store must be decoded, and has the right
     # size anyway
     opened = frames if isinstance(sequence, FolderSequence) else read
-    return _CheckedFrames(sequence, frames, opened, read)
+    return _CheckedFrames(sequence, frames, opened, read, accept)
 
 
 _Examined = tuple[list[Finding], SequenceReport]
@@ -213,15 +243,16 @@ def _examine(plan: _CheckedFrames, step: Callable[[], None] = lambda: None) -> _
     for frame in plan.opened:
         findings.extend(check_shapes(sequence, frame, with_grids=described))
         step()
-    evidence: dict[str, GridEvidence] = {}
-    below: dict[str, GroundBelow] = {}
+    facts, evidence, below = ScanFacts(), dict[str, GridEvidence](), dict[str, GroundBelow]()
     for frame in plan.read:
         if described:
             findings.extend(check_values(sequence, frame))
-            _measure_grids(sequence, frame, evidence, below)
+            _measure_grids(sequence, frame, facts, evidence, below)
         step()
+    made = facts.made(sequence) if described else []
     if described:
         findings.extend(check_reports(sequence, plan.read))
+        findings.extend(facts.findings(sequence))
         findings.extend(check_inputs(sequence))
     shares = {}
     for name, grid in evidence.items():
@@ -230,14 +261,16 @@ def _examine(plan: _CheckedFrames, step: Callable[[], None] = lambda: None) -> _
             shares[name] = diagnosis.share
             findings.extend(_judge_grid(sequence, name, grid.spec, diagnosis))
         findings.extend(below[name].findings(sequence, name))
-    poses = _diagnose_poses(sequence)
-    if poses is not None:
-        findings.extend(_judge_poses(sequence, poses))
+    poses, overlap = _diagnose_poses(sequence)
+    if poses is not None and overlap is not None:
+        made.append(OVERLAP)
+        findings.extend(_judge_poses(sequence, poses, overlap))
     step()
     images = compare_images(sequence) if described else []
     findings.extend(judge_images(sequence, images))
     quality = None if poses is None else poses.quality
     mounting = None if quality is None else quality.mounting
+    findings, checks = judge(sequence, findings, made, plan.accept)
     return findings, SequenceReport(
         sequence.path,
         len(plan.frames),
@@ -248,6 +281,7 @@ def _examine(plan: _CheckedFrames, step: Callable[[], None] = lambda: None) -> _
         None if quality is None else quality.refined_m,
         {} if mounting is None else mounting.describe(),
         {agreement.camera: str(agreement) for agreement in images},
+        checks,
     )
 
 
@@ -260,19 +294,22 @@ def _is_described(sequence: Sequence) -> bool:
 
 
 def _measure_grids(
-    sequence: Sequence, frame: int, evidence: dict[str, GridEvidence], below: dict[str, GroundBelow]
+    sequence: Sequence,
+    frame: int,
+    facts: ScanFacts,
+    evidence: dict[str, GridEvidence],
+    below: dict[str, GroundBelow],
 ) -> None:
-    """Compare the points of a frame with its grids.
+    """Measure the points of a frame, and compare them with its grids.
 
     Files that cannot be read are skipped: other checks report them.
     """
-    if "points" not in sequence.fields():
-        return
-    try:
-        points, labels = _points(sequence, frame)
-    except CarlascError:
-        return
-    ground = ground_of(points, labels, sequence.metadata.classes.ground)
+    points = labels = None
+    if "points" in sequence.fields():
+        with suppress(CarlascError):
+            points, labels = _points(sequence, frame)
+            facts.add(points)
+    ground = None if points is None else ground_of(points, labels, sequence.metadata.classes.ground)
     for name in sequence.grids:
         # a network makes mistakes, and may have other classes
         if sequence.predicted_by(name) is not None:
@@ -281,8 +318,10 @@ def _measure_grids(
             grid = sequence.grid(name, frame)
         except CarlascError:
             continue
-        evidence.setdefault(name, GridEvidence(grid.spec)).add(points, labels, grid)
-        below.setdefault(name, GroundBelow(grid.spec)).add(ground)
+        facts.occupied.setdefault(name, []).append(bool((grid.labels * grid.known).any()))
+        if points is not None and ground is not None:
+            evidence.setdefault(name, GridEvidence(grid.spec)).add(points, labels, grid)
+            below.setdefault(name, GroundBelow(grid.spec)).add(ground)
 
 
 def _points(sequence: Sequence, frame: int) -> tuple[Float32Array, LabelArray | None]:
@@ -298,32 +337,31 @@ def _points(sequence: Sequence, frame: int) -> tuple[Float32Array, LabelArray | 
     return scan.points[keep], labels
 
 
-def _diagnose_poses(sequence: Sequence) -> PoseDiagnosis | None:
-    """Measure the overlap of scans under their poses; None without scans or valid poses."""
+def _diagnose_poses(sequence: Sequence) -> tuple[PoseDiagnosis, LongOverlap] | tuple[None, None]:
+    """Measure the overlap of scans under their poses; None without several scans or valid poses."""
     if (
         "points" not in sequence.fields()
         or layout.POSES not in sequence.documents()
         or not sequence.metadata.has_rays
+        or len(sequence.frames("points")) < 2
     ):
-        return None
+        return None, None
     frames = sequence.frames("points").tolist()
     try:
         poses = check_rigid(np.stack([sequence.read_pose(frame) for frame in frames]), layout.POSES)
     except CarlascError:
-        return None
+        return None, None
 
-    def structure(index: int) -> FloatArray:
-        try:
-            return static_structure(sequence, frames[index])
-        except CarlascError:
-            return np.empty((0, 3))
+    def reading(read: Callable[[int], Any]) -> Callable[[int], Any]:
+        def points(index: int) -> Any:
+            try:
+                return read(frames[index])
+            except CarlascError:
+                return np.empty((0, 3), np.float32)
 
-    def points(index: int) -> Float32Array:
-        try:
-            return feed.static_points(frames[index])
-        except CarlascError:
-            return np.empty((0, 3), np.float32)
+        return points
 
+    structure = reading(partial(static_structure, sequence))
     feed = ScanFeed(sequence, FromScans())
     try:
         seconds = np.array([feed.time(frame) for frame in frames])
@@ -331,7 +369,8 @@ def _diagnose_poses(sequence: Sequence) -> PoseDiagnosis | None:
         seconds = None
     if seconds is not None and not (np.diff(seconds) > 0).all():
         seconds = None  # which is reported elsewhere
-    return diagnose_poses(structure, poses, points=points, seconds=seconds)
+    found = diagnose_poses(structure, poses, points=reading(feed.static_points), seconds=seconds)
+    return found, measure_overlap(structure, poses)
 
 
 def _judge_grid(
@@ -376,12 +415,17 @@ def _largest_edge(spec: GridSpec) -> float:
     return float(edges.max())
 
 
-def _judge_poses(sequence: Sequence, diagnosis: PoseDiagnosis) -> Iterator[Finding]:
+def _judge_poses(
+    sequence: Sequence, diagnosis: PoseDiagnosis, overlap: LongOverlap
+) -> Iterator[Finding]:
+    where = f"{sequence.location}/{layout.POSES}"
     quality, correction = diagnosis.quality, diagnosis.correction
     mounting = None if quality is None else quality.mounting
+    if "kiss-icp" in str(sequence.metadata.extra.get("poses")):
+        mounting = None  # poses found from the scans are those of the sensor
     described = None if mounting is None else describe_mounting(mounting)
-    check, expected = "poses-on-scans", "scans that overlap under the poses"
-    overlap = f"{diagnosis.share:.1%} of a scan's structure overlaps that of an earlier scan"
+    check, expected = OVERLAP, CHECKS[OVERLAP]
+    share = f"{diagnosis.share:.1%} of a scan's structure overlaps that of an earlier scan"
     severity: Severity = "warning"
     if correction is not None:
         severity, advice = "error", correction.advice
@@ -390,6 +434,18 @@ def _judge_poses(sequence: Sequence, diagnosis: PoseDiagnosis) -> Iterator[Findi
             f"the likely cause is {correction.name}: after correction, "
             f"{diagnosis.corrected_share:.1%}"
         )
+    elif diagnosis.offset_m is not None:
+        x, y, z = diagnosis.offset_m
+        severity = "error"
+        found = f"{share}; scans fit best about ({x:.1f}, {y:.1f}, {z:.1f}) m away from their poses"
+        advice = "check that the poses belong to this sequence and to these frames"
+    elif overlap.is_wrong(diagnosis.share):
+        severity = "error"
+        found = (
+            f"{overlap.share:.1%} of a scan's structure on that of the last scan within "
+            f"{REACH_M:g} m of it, and {diagnosis.share:.1%} on nearer scans: a motion is missing"
+        )
+        advice = "check that the poses belong to this sequence and to these frames"
     elif described is not None:
         found, advice = described
     elif quality is not None and quality.is_poor:
@@ -403,19 +459,15 @@ def _judge_poses(sequence: Sequence, diagnosis: PoseDiagnosis) -> Iterator[Findi
             "write refined poses with `carlasc refine` before you stack scans yourself; `carlasc "
             "regrid` refines them anyway"
         )
-    elif diagnosis.offset_m is not None:
-        x, y, z = diagnosis.offset_m
-        severity = "error"
-        found = (
-            f"{overlap}; scans fit best about ({x:.1f}, {y:.1f}, {z:.1f}) m away from their poses"
-        )
-        advice = "check that the poses belong to this sequence and to these frames"
     elif diagnosis.pairs and diagnosis.share < _NO_OVERLAP:
-        found = f"{overlap}, and no known correction raises it"
+        found = f"{share}, and no known correction raises it"
         advice = (
             "check that the poses belong to this sequence, or estimate them with `carlasc convert "
             "--poses kiss-icp`"
         )
     else:
-        return
-    yield Finding(severity, check, f"{sequence.location}/{layout.POSES}", expected, found, advice)
+        check = found = advice = ""
+    if check:
+        yield Finding(severity, check, where, expected, found, advice)
+    if check != OVERLAP and overlap.why_untested:
+        yield untested(OVERLAP, where, overlap.why_untested)

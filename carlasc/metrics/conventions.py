@@ -20,7 +20,7 @@ from carlasc.core.benchmarks import (
     TO_OCC3D,
     TO_SSCBENCH,
 )
-from carlasc.core.classes import ClassTable, Remap, tables_with, times
+from carlasc.core.classes import ClassTable, Remap, ids_in, tables_with, times
 from carlasc.core.tables import (
     CARLA,
     CARLASC11,
@@ -195,8 +195,7 @@ class Convention:
         """Return the ids in labels of a table, of any shape, for which the convention has no class,
         with their numbers of occurrences.
         """
-        wrong = labels[self._look_up(labels, table) == _UNKNOWN]
-        return dict(zip(*(x.tolist() for x in np.unique(wrong, return_counts=True)), strict=True))
+        return ids_in(labels[self._look_up(labels, table) == _UNKNOWN])
 
     def _look_up(self, labels: AnyArray, table: ClassTable) -> Uint8Array:
         # the last entry is for all larger ids
@@ -250,15 +249,12 @@ def convention_named(name: str) -> Convention:
     return CONVENTIONS[name]
 
 
-def own_convention(
-    table: ClassTable, *, free: int | None = None, remap: Remap | None = None
-) -> Convention:
+def own_convention(table: ClassTable, *, remap: Remap | None = None) -> Convention:
     """Return a convention that scores the unchanged ids of a class table: known voxels, and the
     mean over all classes that occur, including free.
 
     Args:
         table: the scored classes.
-        free: id of free space; None takes that of the table.
         remap: map from the ids of another table, whose labels can then be scored too.
     """
     maps = {table.name: _identity(table)}
@@ -268,7 +264,7 @@ def own_convention(
         "own",
         f"the data's own classes ({table.name})",
         table,
-        table.free if free is None else free,
+        table.free,
         tuple(sorted(table.names)),
         maps,
         table,

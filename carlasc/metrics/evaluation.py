@@ -68,7 +68,7 @@ class Scorer:
             if source_classes is None
             else read_classes(source_classes, "source_classes")
         )
-        self.convention = _resolve(convention, pairs, given, remap)
+        self.convention = _resolve(convention, pairs, remap)
         self.found = None if given is not None else _find_by_ids(pairs, self.convention)
         self.tables: dict[str, tuple[ClassTable, ClassTable]] = {}
         self.uses: tuple[set[TableUse], set[TableUse]] = (set(), set())
@@ -160,6 +160,11 @@ class Scorer:
                     f"{sum(ids.values())} voxels of the {side} have ids that are no class and "
                     f"{become}: {times(dict(sorted(ids.items())))}"
                 )
+        if self.rays is not None and np.isnan(self.rays.compute().rayiou):
+            yield (
+                "no ray was cast (RayIoU): no known position of the sensor is at least 1 m inside "
+                "of a grid; poses.txt gives those of other frames"
+            )
         guessed = [use.table for use in sorted(self.uses[0]) if use.found in ("assumed", "ids")]
         predicted, true = (np.flatnonzero(summed.counts.sum(axis=axis)) for axis in (0, 1))
         if guessed and len(predicted) and len(true) and predicted[-1] < true[-1]:
@@ -315,33 +320,20 @@ class Scorer:
 
 
 def _resolve(
-    convention: str | Convention | None,
-    pairs: list[Pair],
-    given: ClassTable | None,
-    remap: Remap | None,
+    convention: str | Convention | None, pairs: list[Pair], remap: Remap | None
 ) -> Convention:
     if isinstance(convention, Convention):
         return convention
-    tables = [
-        side.classes
-        for pair in pairs
-        for side in (pair.truth, pair.prediction)
-        if side.classes is not None
-    ]
-    table = tables[0] if tables else CARLA
+    sides = (side for pair in pairs for side in (pair.truth, pair.prediction))
+    table = next((side.classes for side in sides if side.classes is not None), CARLA)
     if convention is None:
         convention = pairs[0].truth.benchmark or "carlasc"
-        if table.name not in CONVENTIONS[convention].maps:
-            convention = "own"
         # classes of one's own, with a map from those of the ground truth
-        if (
-            given is not None
-            and given.name not in CONVENTIONS["carlasc"].maps
-            and remap is not None
-        ):
+        own = remap is not None and remap.target.name not in CONVENTIONS["carlasc"].maps
+        if own or table.name not in CONVENTIONS[convention].maps:
             convention = "own"
     if convention == "own":
-        return own_convention(table if remap is None or given is None else given, remap=remap)
+        return own_convention(table if remap is None else remap.target, remap=remap)
     return convention_named(convention)
 
 

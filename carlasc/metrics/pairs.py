@@ -19,11 +19,11 @@ from carlasc.storage.folder import FolderSequence
 from carlasc.storage.layout import identity_of
 from carlasc.storage.voxel_files import (
     GridFrames,
-    LabelFolder,
+    LabelFrames,
     VoxelFrames,
     VoxelSequence,
-    VoxelSource,
     find_voxels,
+    label_frames,
 )
 
 Place = AnyPath | Source
@@ -90,7 +90,7 @@ def pair_grids(
     for pair in pairs:
         itself = str(Path(source).absolute()) if not isinstance(source, Source) else ""
         same = pair.prediction.location == pair.truth.location != itself
-        if same and isinstance(pair.prediction, LabelFolder) and grid is None:
+        if same and isinstance(pair.prediction, LabelFrames) and grid is None:
             raise MissingDataError(
                 pair.truth.location,
                 expected="predictions in another folder than the ground truth",
@@ -99,23 +99,27 @@ def pair_grids(
         pair.prediction.follow(pair.truth)
     if left := sorted(set(truths) - {pair.truth.path for pair in pairs}):
         missing = f"{len(left)} of {len(truths)} sequences of the ground truth have no prediction"
-        notes.append(f"{missing} and were not scored: {_first(left)}")
+        notes.append(f"{missing} and were not scored: {first_names(left, 3)}")
     if alone:
-        names = _first([grids.path or grids.location for grids in alone])
+        names = first_names((grids.path or grids.location for grids in alone), 3)
         missing = f"{len(alone)} of {len(predictions)} predicted sequences have no ground truth"
         notes.append(f"{missing} and were not scored: {names}")
-    for pair in pairs:
-        true = set(pair.truth.frames().tolist())
-        if extra := [n for n in pair.prediction.frames().tolist() if n not in true]:
-            names = _first([pair.prediction.name_of(number) for number in extra])
-            where = f" of {pair.truth.path}" if pair.truth.path else ""
+    for prediction in predictions:
+        found = [pair.truth for pair in pairs if pair.prediction.location == prediction.location]
+        if found and (extra := _without_truth(prediction, found)):
+            where = f" of {prediction.path}" if prediction.path else ""
             frames = count(len(extra), "predicted frame")
-            notes.append(f"{frames}{where} without ground truth: {names}")
+            notes.append(f"{frames}{where} without ground truth: {first_names(extra, 3)}")
     return pairs, tuple(notes)
 
 
-def _first(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+def _without_truth(prediction: GridFrames, truths: list[GridFrames]) -> list[str]:
+    """Return the names of the frames of a prediction that none of its true grids has."""
+    if isinstance(prediction, VoxelFrames) and not prediction.numbered:
+        files = [truth.files.keys() for truth in truths if isinstance(truth, VoxelFrames)]
+        return sorted(prediction.files.keys() - set().union(*files))
+    numbers = {number for truth in truths for number in truth.frames().tolist()}
+    return [str(n) for n in prediction.frames().tolist() if n not in numbers]
 
 
 def _chosen(grids: GridFrames, sequences: Collection[str]) -> bool:
@@ -185,16 +189,16 @@ def open_grids(place: Place, grid: str | None, role: Role) -> Iterator[GridFrame
         # folder of one grid; the folder above is the sequence
         if (folder / layout.PARAMS).is_file():
             source, grid = folder.absolute().parent, folder.absolute().name
-        elif folder.is_dir() and len((plain := LabelFolder(folder)).frames()):
+        elif folder.is_dir() and (plain := label_frames(folder)) is not None:
             # a folder in the tree of a benchmark has its rules
             yield from list(_foreign(find_voxels(folder), grid, role)) or (plain,)
             return
     source = as_source(source)
+    for frames in _foreign(source, grid, role):
+        yield frames
+        names.append(frames.path)
     for sequence in source.sequences().values():
         if isinstance(sequence, VoxelSequence):
-            for frames in _of_sequence(sequence.frames_of, grid, role):
-                yield frames
-                names.append(sequence.path)
             continue
         name = _choose_grid(sequence, grid)
         beside = _without_params(sequence, grid)
@@ -218,20 +222,15 @@ def open_grids(place: Place, grid: str | None, role: Role) -> Iterator[GridFrame
         )
 
 
-def _foreign(source: VoxelSource | None, grid: str | None, role: Role) -> Iterator[GridFrames]:
-    for grids in () if source is None else source.frames_of().values():
-        yield from _of_sequence(grids, grid, role)
-
-
-def _of_sequence(
-    grids: Mapping[str, GridFrames], grid: str | None, role: Role
-) -> Iterator[GridFrames]:
-    """Yield one grid of a sequence of another program: `grid`, or the first one, which is ground
-    truth; for predictions the last one.
+def _foreign(source: Source | None, grid: str | None, role: Role) -> Iterator[GridFrames]:
+    """Yield one grid of each sequence in files of another program: `grid`, or the first one, which
+    is ground truth; for predictions the last one.
     """
-    usual = [*grids][-1 if role == "prediction" else 0]
-    if (grid or usual) in grids:
-        yield grids[grid or usual]
+    for sequence in () if source is None else source.sequences().values():
+        if isinstance(sequence, VoxelSequence):
+            usual = [*sequence.frames_of][-1 if role == "prediction" else 0]
+            if (grid or usual) in sequence.frames_of:
+                yield sequence.frames_of[grid or usual]
 
 
 def _without_params(sequence: Sequence, grid: str | None) -> GridFrames | None:
@@ -242,8 +241,7 @@ def _without_params(sequence: Sequence, grid: str | None) -> GridFrames | None:
         return None
     if grid in layout.scan_folders() or not (folder := sequence.folder / grid).is_dir():
         return None
-    plain = LabelFolder(folder, sequence.path)
-    return plain if len(plain.frames()) else None
+    return label_frames(folder, sequence.path)
 
 
 def _choose_grid(sequence: Sequence, grid: str | None) -> str | None:

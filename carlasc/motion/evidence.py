@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from carlasc.core.arrays import (
+    AnyFloatArray,
     BoolArray,
     Float32Array,
     FloatArray,
@@ -54,6 +55,11 @@ _BAND_M = (
 )
 _FLAGGED_SHARE = 0.6  # a cluster with this share of moved points moved as a whole
 _PERIOD_S = 0.1  # period of scans whose times do not increase
+OWN_CELL_M, OWN_CELLS = 0.2, 40
+OWN_REACH_M = OWN_CELL_M * OWN_CELLS / 2
+"""Parts of the recording vehicle are found in so many cells of this size along each axis, around
+the sensor, up to this distance.
+"""
 
 
 @dataclass(frozen=True)
@@ -108,6 +114,7 @@ class FreeSpaceEvidence:
         around: number of static points around each cluster, at its height. It is large for pieces
             of static objects.
         world_T_sensor: (4, 4) pose of the scan.
+        near: (K,) cells of the points around the sensor that are not ground: see `cells_around`.
     """
 
     frame: int
@@ -119,6 +126,7 @@ class FreeSpaceEvidence:
     freed: tuple[int, ...]
     around: tuple[int, ...]
     world_T_sensor: Transform
+    near: IntArray
 
     def thinned(self, most: int = 400) -> FreeSpaceEvidence:
         """Return the same with at most `most` of the `points` of each cluster; `clusters` stay
@@ -224,7 +232,19 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     ]
     around = _count_around(world, groups, static)
     parts = (tuple(clusters), tuple(points), tuple(classes), freed, around)
-    return FreeSpaceEvidence(scan.frame, own.seconds, len(scan.points), *parts, scan.world_T_sensor)
+    near = cells_around(scan.points[candidates])
+    return FreeSpaceEvidence(
+        scan.frame, own.seconds, len(scan.points), *parts, scan.world_T_sensor, near
+    )
+
+
+def cells_around(points: AnyFloatArray) -> IntArray:
+    """Return the (K,) cells of (N, 3) points near the sensor, metres, sensor frame, each once:
+    indices of a flat array of `OWN_CELLS` along each axis.
+    """
+    near = points[(np.abs(points) < OWN_REACH_M).all(axis=1)]
+    cells = np.floor(near / OWN_CELL_M).astype(np.int64) + OWN_CELLS // 2
+    return np.unique(np.ravel_multi_index(tuple(cells.T), (OWN_CELLS,) * 3, mode="clip"))
 
 
 def _sensors(origins: Float32Array) -> list[IntArray]:

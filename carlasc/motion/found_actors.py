@@ -10,9 +10,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from carlasc.core.arrays import FloatArray, IntArray
-from carlasc.core.geometry import Transform, invert, thin, transform_points
-from carlasc.motion.evidence import FreeSpaceEvidence
+from carlasc.core.arrays import BoolArray, FloatArray, IntArray
+from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
+from carlasc.motion.evidence import (
+    OWN_CELL_M,
+    OWN_CELLS,
+    OWN_REACH_M,
+    FreeSpaceEvidence,
+    cells_around,
+)
 from carlasc.motion.paths import estimate_path, is_static, middles_of, misalignment
 from carlasc.motion.planes import nearest_points
 from carlasc.motion.segments import Segment
@@ -39,12 +45,13 @@ _WEIGHTS = (1.0, 1.5, -12.5, 5.0, 1.5, -4.5)  # of 1 and of the terms of `_confi
 _LEAST_CONFIDENCE = 0.5  # of an actor
 _STAYS_M, _SENSOR_PATH_M = 0.5, 1.0  # points that move with the sensor, while it drives so far
 _LINE_SLOPE = 0.004  # a quarter of a degree: the points of one scan line differ by less
-# half the width of the recording vehicle, and how far from the sensor it reaches
-_OWN_HALF_M, _OWN_REACH_M = (
-    1.3,
-    3.5,
-)
-_OWN_MARGIN_M = 0.2  # around most of its points
+# Parts of the recording vehicle: cells around the sensor in which nearly all scans have points,
+# often at places that were free at other times; and cells beside them with such points. Deskewing
+# moves such parts by decimetres whenever the speed changes, so that they do not look rigid: they
+# cannot be told from a person who walks beside the sensor at exactly its pace.
+_ALWAYS, _FREED, _OFTEN = 0.95, 0.3, 0.3
+_BESIDE_M = 1.8  # farther beside the way of the sensor, another vehicle may drive along
+_OWN_SHARE = 0.5  # an actor with so many points in these cells is none
 _SAMPLES = 300  # points of an observation that its path is estimated from
 
 
@@ -70,7 +77,8 @@ class ActorFollower:
     Attributes:
         moved: (M,) indices of the points that moved, tracked or not, by frame.
         own: (6,) lower and upper corners of the parts of the recording vehicle, metres, sensor
-            frame.
+            frame; known after `finish`.
+        riders: the numbers of the actors that are such parts; known after `finish`.
     """
 
     def __init__(
@@ -91,6 +99,12 @@ class ActorFollower:
         """
         self.moved: dict[int, IntArray] = {}
         self.own: list[FloatArray] = []
+        self.riders: set[int] = set()
+        # in how many scans each cell has points, and in how many clusters
+        self._near, self._freed = np.zeros((2, OWN_CELLS**3), np.int64)
+        self._cells: dict[int, list[IntArray]] = {}
+        self._poses: list[Transform] = []
+        self._close: list[tuple[int, IntArray, IntArray]] = []
         self._deformable, self._label, self._number = deformable, default_label, first_instance
         self._alive: list[_ActorChain] = []
 
@@ -99,6 +113,14 @@ class ActorFollower:
         before it.
         """
         self.moved[scan.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
+        self._poses.append(scan.world_T_sensor)
+        self._near[scan.near] += 1
+        for members, points in zip(scan.clusters, scan.points, strict=True):
+            local = transform_points(invert(scan.world_T_sensor), points)
+            cells = cells_around(local)
+            self._freed[cells] += 1
+            if len(cells) and np.abs(local).max() < OWN_REACH_M:
+                self._close.append((scan.frame, members, cells))
         before, self._alive = self._alive, []
         ended = list[_ActorChain]()
         for one in before:
@@ -109,16 +131,46 @@ class ActorFollower:
         return actors
 
     def finish(self) -> list[FoundActor]:
-        """Return the actors that have not ended."""
-        return self._actors(self._alive)
+        """Return the actors that have not ended, and find the parts of the recording vehicle."""
+        actors = self._actors(self._alive)
+        own = self._own_cells()
+        for number, seen in self._cells.items():
+            elsewhere = sum(not len(cells) for cells in seen)
+            inside = own.ravel()[np.concatenate(seen)]
+            if inside.sum() > _OWN_SHARE * (len(inside) + elsewhere):
+                self.riders.add(number)
+        lower = (np.argwhere(own) - OWN_CELLS // 2) * OWN_CELL_M
+        self.own = list(np.hstack([lower - OWN_CELL_M, lower + 2 * OWN_CELL_M]))
+        wide = _widened(own).ravel()
+        for frame, members, cells in self._close:
+            if wide[cells].all():  # found by their place
+                self.moved[frame] = np.setdiff1d(self.moved[frame], members)
+        return [actor for actor in actors if actor.segments[0].instance not in self.riders]
+
+    def _own_cells(self) -> BoolArray:
+        """Return the cells of the recording vehicle, as a cube: what stays at one place of the
+        sensor frame over the whole drive, and is not static.
+        """
+        poses, scans = np.array(self._poses).reshape(-1, 4, 4), len(self._poses)
+        near, freed = (count.reshape((OWN_CELLS,) * 3) for count in (self._near, self._freed))
+        steps = np.diff(poses[:, :3, 3], axis=0)
+        if np.abs(steps).sum(axis=0).max(initial=0.0) < _SENSOR_PATH_M:
+            return np.zeros(near.shape, np.bool_)
+        x, y, _ = multiply(invert(poses[:-1])[:, :3, :3], steps[..., None]).sum(axis=0)[:, 0]
+        places = (np.arange(OWN_CELLS) - OWN_CELLS // 2) * OWN_CELL_M
+        across_m = np.abs(x * places - y * places[:, None]) / max(float(np.hypot(x, y)), 1e-6)
+        own = (near >= _ALWAYS * scans) & (freed >= _FREED * scans)
+        own &= (across_m < _BESIDE_M)[..., None]
+        while (more := _widened(own) & ~own & (freed >= _OFTEN * scans)).any():
+            own |= more
+        return own
 
     def _actors(self, chains: list[_ActorChain]) -> list[FoundActor]:
         actors = []
         for one in chains:
-            if (part := one.own_vehicle()) is not None:
-                self.own.append(part)
-            elif actor := one.actor(self._deformable, self._number, self._label):
+            if actor := one.actor(self._deformable, self._number, self._label):
                 actors.append(actor)
+                self._cells[self._number] = one.cells()
                 self._number += 1
         return actors
 
@@ -322,21 +374,12 @@ class _ActorChain:
             local if stays and driven > _SENSOR_PATH_M and len(local) >= _MIN_OBSERVATIONS else None
         )
 
-    def own_vehicle(self) -> FloatArray | None:
-        """Return the (6,) lower and upper corner, metres, sensor frame, of a part of the recording
-        vehicle; None if it is none.
-        """
-        local = self._in_sensor()
-        if local is None:
-            return None
-        steps = np.gradient(np.stack([link.world_T_sensor[:2, 3] for link in self.links]), axis=0)
-        for link, step in zip(self.links, steps, strict=True):
-            x, y, _ = (link.segment.points - link.world_T_sensor[:3, 3]).T
-            across = np.abs(x * step[1] - y * step[0]) / max(float(np.hypot(*step)), 1e-6)
-            if across.max() > _OWN_HALF_M or np.hypot(x, y).max() > _OWN_REACH_M:
-                return None
-        low, high = np.quantile(np.concatenate(local), (0.05, 0.95), axis=0)
-        return np.concatenate([low - _OWN_MARGIN_M, high + _OWN_MARGIN_M])
+    def cells(self) -> list[IntArray]:
+        """Return the cells around the sensor in which each observation has points."""
+        return [
+            cells_around(transform_points(invert(link.world_T_sensor), link.segment.points))
+            for link in self.links
+        ]
 
     def _is_scan_line(self) -> bool:
         """Return whether its points are of one scan line and move with the sensor, as where a scan
@@ -349,6 +392,12 @@ class _ActorChain:
         return bool(
             np.ptp(np.quantile(z / np.maximum(np.hypot(x, y), 1e-3), (0.05, 0.95))) < _LINE_SLOPE
         )
+
+
+def _widened(cells: BoolArray) -> BoolArray:
+    """Return the cells of a cube, and those beside them."""
+    blocks = np.lib.stride_tricks.sliding_window_view(np.pad(cells, 1), (3, 3, 3))
+    return np.asarray(blocks.any(axis=(3, 4, 5)))
 
 
 def _is_small(size: FloatArray) -> bool:

@@ -33,7 +33,6 @@ Scans that are at most so far apart are always compared.
 """
 
 _MIN_SCANS, _MIN_POINTS = 3, 8  # least numbers of a plane
-_WIDE_M2 = 0.02  # least variance of a plane along its second axis: narrower clusters are lines
 POINT_M = 0.03  # error of a point
 _EQUAL = 4  # greatest number of points of a cluster that count
 _INDEPENDENT = 0.1  # share of the clusters whose errors are independent
@@ -60,12 +59,14 @@ class AlignmentPass(NamedTuple):
         thick_m: greatest standard deviation of a plane along its normal.
         flat: greatest variance of a plane along its normal, as a share of the variance along its
             second axis.
+        wide_m2: least variance of a plane along its second axis: narrower clusters are lines.
     """
 
     cell_m: float
     repeats: int
     thick_m: float
     flat: float
+    wide_m2: float = 0.02
 
 
 PASSES = (AlignmentPass(2.0, 5, 0.35, 0.1), AlignmentPass(1.0, 6, 0.12, 0.03))
@@ -91,6 +92,7 @@ def align(
     start: FloatArray,
     given: FloatArray,
     fixed: int = 0,
+    passes: Sequence[AlignmentPass] = PASSES,
 ) -> FloatArray:
     """Return the poses under which scans agree best.
 
@@ -100,6 +102,7 @@ def align(
             most some decimetres.
         given: (F, 4, 4) poses of the prior, which hold where the scans do not determine a pose.
         fixed: number of scans at the beginning whose poses stay.
+        passes: over the cells, one after the other.
 
     Returns:
         (F, 4, 4) world_T_sensor.
@@ -109,7 +112,7 @@ def align(
         return poses
     # Large cells first: they still hold the same surface in all scans while poses are wrong by
     # decimetres. Small cells are flat where large ones are not, and decide the last centimetres.
-    for one in PASSES:
+    for one in passes:
         for repeat in range(one.repeats):
             matrix, right = np.zeros((6 * free, 6 * free)), np.zeros(6 * free)
             # Every other step moves the cells by half, so that no surface is cut at the same places
@@ -224,7 +227,7 @@ def planes(
     enough, covariances = spread_of(block, poses, _MIN_SCANS)
     values, vectors = principal_axes(covariances)
     flat = enough & (values[:, 0] < limits.thick_m**2) & (values[:, 0] < limits.flat * values[:, 1])
-    flat &= values[:, 1] > _WIDE_M2
+    flat &= values[:, 1] > limits.wide_m2
     return vectors[:, :, 0], np.where(flat, np.maximum(values[:, 0], 0.0), -1.0)
 
 

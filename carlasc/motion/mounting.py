@@ -3,9 +3,9 @@ estimated from motions.
 
 In turns, poses of an IMU, a camera or the rear axle move differently from those of the sensor. Late
 poses differ while the speed or the turn rate changes. One constant transform and one constant delay
-are fitted to the motions of the aligned scans (`joint_alignment`) by least squares, with a standard
-error for each number. It is large for what a drive does not determine: the height of the sensor on
-a flat road, and its whole position on a straight road.
+are fitted to the motions of the aligned scans (`joint_alignment`) by least squares, with an
+interval for each number. It is wide for what a drive does not determine: the height of the sensor
+on a flat road, and its whole position on a straight road.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from carlasc.core.arrays import BoolArray, FloatArray
+from carlasc.core.arrays import BoolArray, FloatArray, IntArray
 from carlasc.core.geometry import Transform, invert, multiply, rotations_of, slerp, small_motions
 from carlasc.motion.solving import solve_positive
 
@@ -30,9 +30,14 @@ _STEP = np.array([0.05, 0.05, 0.05, 2e-3, 2e-3, 2e-3, 0.01])  # steps of the num
 # greatest error of a known value
 _DETERMINED = np.array([0.2, 0.2, 0.2, *np.deg2rad([1.0, 1.0, 1.0]), 0.03])
 # smaller values need no correction
-# fact: relevant-mounting
 _RELEVANT = np.array([0.15, 0.15, 0.15, *np.deg2rad([0.5, 0.5, 0.5]), 0.02])
-_CERTAIN = 4.0  # values of fewer standard errors need none either
+_CERTAIN = 2.5  # values within so many times their error need none either
+# least half width of an interval: scans are not corrected for motion exactly, nor interpolated
+_SYSTEMATIC = np.array([0.08, 0.08, 0.08, *np.deg2rad([0.1, 0.1, 0.1]), 0.01])
+_GROUP, _GROUPS = 30, 3  # most scans whose errors are related, and least groups of them
+# Poses drift if what remains grows so many times over seconds, to so many least deviations.
+_GROWS, _MUCH = 1.5, 5.0
+_EXPLAINED = 3.0  # least variance that a value explains, in variances of what remains
 _LIMITS = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5, 2.0])  # greatest values
 _NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "late")
 
@@ -45,7 +50,9 @@ class Mounting:
         values: (7,) x, y, z of the sensor in metres, its rotation vector in radians, and the delay
             of the poses in seconds: a scan has the pose that the file gives for a later time. Exact
             poses of the sensor have zeros.
-        errors: (7,) standard errors, infinite where a value is not determined.
+        errors: (7,) half the widths of intervals that hold the true value in 95 % of the cases
+            (docs/studies/poses.md), infinite where a value is not determined, or where drift,
+            jitter or distortion of the poses explain as much.
     """
 
     values: FloatArray
@@ -64,16 +71,23 @@ class Mounting:
         )
 
     def correct(self, poses: FloatArray, seconds: FloatArray) -> FloatArray:
-        """Return the (F, 4, 4) poses of the sensor from given poses and their (F,) times: the wrong
-        values are applied. The first pose stays.
+        """Return the (F, 4, 4) poses of the sensor from given poses and their (F,) times: a wrong
+        place and a delay are applied. Rotations are not, because they may come from a calibration
+        that is right. The first pose stays.
         """
         values = np.where(self.wrong, self.values, 0.0)
+        values[3:6] = 0.0
         moved = slerp(poses, seconds, seconds + values[6]) if values[6] else poses
         sensor = multiply(moved, _transform(values))
         return multiply(poses[0], invert(sensor[0]), sensor)
 
+    @property
+    def is_moved(self) -> bool:
+        """Whether `correct` changes poses."""
+        return bool(self.wrong[[0, 1, 2, 6]].any())
+
     def describe(self) -> dict[str, str]:
-        """Return each value with its standard error and unit, or "undetermined", by name."""
+        """Return each value with its interval and unit, or "undetermined", by name."""
         scales = (1.0, 1.0, 1.0, *np.rad2deg(np.ones(3)), 1.0)
         units = ("m", "m", "m", "degrees", "degrees", "degrees", "s")
         return {
@@ -97,7 +111,8 @@ def find_mounting(
         runs: the aligned poses, in any frame: the row of the first scan, and the (K, 4, 4) poses of
             this scan and the following ones.
     """
-    parts = [_Motions.of(poses, seconds, first, aligned) for first, aligned in runs]
+    related = min(_GROUP, sum(len(aligned) for _, aligned in runs) // _GROUPS)
+    parts = [_Motions.of(poses, seconds, first, aligned, related) for first, aligned in runs]
     if sum(len(part.given) for part in parts) < 2 * len(_LEAST) * len(_LAGS):
         return None
     values = np.zeros(7)
@@ -119,7 +134,26 @@ def find_mounting(
         step = solve_positive(information.copy(), right)
         values = np.clip(values + step, -_LIMITS, _LIMITS)
     inverse = np.stack([solve_positive(information.copy(), row) for row in np.eye(7)])
-    return Mounting(values, np.sqrt(_SAME * np.diag(inverse)))
+    # Drift and distortion make errors that motions within some seconds share, so their sums vary
+    # more than those of independent ones. Few sums need a wider interval (Student's t).
+    pulls = (weights[:, :, None] * slope * scaled[:, :, None]).sum(axis=1)
+    shared = np.concatenate([part.groups + 1j * row for row, part in enumerate(parts)])
+    sums = np.stack([pulls[shared == group].sum(axis=0) for group in np.unique(shared)])
+    more = max(len(sums) - 1, 1)
+    spread = inverse @ (sums.T @ sums) @ inverse * (more + 1) / more
+    apart = (2.0 + 3.0 / more + 3.0 / more**2) * np.sqrt(np.diag(spread))
+    # A value that moves the sensor little against what remains after seconds is not named: drift
+    # and distortion explain as much.
+    spans = np.concatenate([part.at[:, 1] - part.at[:, 0] for part in parts])
+    longest = spans > 0.75 * spans.max()
+    left = np.square(1.4826 * np.median(np.abs(scaled[longest]), axis=0))
+    explained = (np.square(slope[longest] * values).mean(axis=0) / left[:, None]).max(axis=0)
+    errors = np.maximum(np.maximum(2.0 * np.sqrt(_SAME * np.diag(inverse)), apart), _SYSTEMATIC)
+    off_by = np.median(np.sqrt(left) * scale / _LEAST)
+    if np.median(left) > _GROWS and off_by > _MUCH:  # drift, of which no interval is known
+        errors[:] = np.inf
+    unsure = (explained < _EXPLAINED) & (np.abs(values) > errors)
+    return Mounting(values, np.where(unsure, np.inf, errors))
 
 
 @dataclass(frozen=True)
@@ -131,12 +165,14 @@ class _Motions:
         aligned: (K, 4, 4) aligned poses.
         seconds: (K,) times of these scans.
         at: (P, 2) times of the start and the end of each motion.
+        groups: (P,) number of the part of the run that each motion is in.
     """
 
     given: FloatArray
     aligned: FloatArray
     seconds: FloatArray
     at: FloatArray
+    groups: IntArray
 
     @classmethod
     def of(
@@ -145,8 +181,9 @@ class _Motions:
         seconds: FloatArray,
         first: int,
         aligned: FloatArray,
+        related: int,
     ) -> _Motions:
-        """Pair the scans of a run."""
+        """Pair the scans of a run; `related` scans are a group."""
         rows = np.concatenate(
             [
                 np.stack([np.arange(len(aligned) - lag), np.arange(lag, len(aligned))], axis=1)
@@ -156,7 +193,8 @@ class _Motions:
             or [np.empty((0, 2), np.int64)]
         )
         given, own = poses[first + rows], seconds[first : first + len(aligned)]
-        return cls(multiply(invert(given[:, 0]), given[:, 1]), aligned, own, own[rows])
+        motions = multiply(invert(given[:, 0]), given[:, 1])
+        return cls(motions, aligned, own, own[rows], rows.sum(axis=1) // (2 * related))
 
 
 def _residuals(parts: Sequence[_Motions], values: FloatArray) -> FloatArray:

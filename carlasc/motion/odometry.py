@@ -1,5 +1,9 @@
-"""Odometry: the poses of scans, estimated by KISS-ICP (Vizzo et al., RA-L 2023) through its Python
-API, and deskewing.
+"""Odometry: the poses of scans, and deskewing.
+
+On a street, KISS-ICP estimates them (Vizzo et al., RA-L 2023), through its Python API. Elsewhere
+(indoors, low above the ground, in the air, tilted), its points do not fix the motion: a ring of
+points lies where the same ring of the scan before lay. There, scans are aligned to the planes of
+the scans before.
 
 The points of a scan are measured one after the other, while the sensor moves.
 """
@@ -14,12 +18,20 @@ from typing import Any
 import numpy as np
 
 from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray, IntArray
-from carlasc.core.cells import distinct
+from carlasc.core.cells import distinct, first_of_cells
 from carlasc.core.compiling import cached
-from carlasc.core.geometry import Transform, invert, slerp, transform_points
-from carlasc.core.scans import finite
+from carlasc.core.geometry import (
+    Transform,
+    invert,
+    poses_from,
+    quaternions_of,
+    slerp,
+    transform_points,
+)
+from carlasc.core.scans import finite, lengths
 from carlasc.errors import ArgumentError, import_extra
-from carlasc.motion.ground import ground_points
+from carlasc.motion.ground import ground_height, ground_points
+from carlasc.motion.joint_alignment import AlignmentPass, align
 
 MIN_POINTS = 100  # scans with fewer points do not determine the motion
 _NEAR_M = 8.0  # farther ground is left out
@@ -35,6 +47,16 @@ _ABOVE_M = 0.2
 _FASTEST_M_S = 40.0
 _CLEARLY = 1.1  # so many times the overlap make another start the better one
 
+# A street: most scans at the start show the ground so far below the sensor, and points far away.
+_VEHICLE_M, _FAR = (1.2, 4.0), (0.95, 12.0)  # heights; a quantile of distances, and its least value
+_VOXELS, _FINE_M, _COARSE_M = 20.0, 0.1, 0.2  # voxels in half of the points' distances; limits
+_HELD = 10  # number of scans whose planes hold the next one
+_PASSES = (
+    AlignmentPass(2.0, 4, 0.35, 0.1, 0.008),
+    AlignmentPass(1.0, 4, 0.12, 0.05, 0.008),
+    AlignmentPass(0.5, 4, 0.08, 0.03, 0.008),
+)
+
 UsableScan = tuple[AnyFloatArray, AnyFloatArray | None]
 """(N, 3) points that `usable_points` chose, metres, sensor frame, and the (N,) seconds of each
 after the time of its frame, or None.
@@ -48,6 +70,7 @@ def estimate_poses(
     times: Sequence[float] | AnyFloatArray | None = None,
     max_range_m: float = 100.0,
     min_range_m: float = 0.0,
+    voxel_m: float | None = None,
     total: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> FloatArray:
@@ -61,6 +84,7 @@ def estimate_poses(
         times: (F,) seconds, increasing: the time of each frame; None for frames at 10 Hz.
         max_range_m: farther points are not used.
         min_range_m: nearer points are not used.
+        voxel_m: as in `follow_scans`.
         total: number of scans, for `progress`.
         progress: called with the number of finished scans and the number of all scans.
 
@@ -73,8 +97,13 @@ def estimate_poses(
             each of its points.
     """
     poses: list[Transform] = []
-    limits = {"max_range_m": max_range_m, "min_range_m": min_range_m}
-    for pose in follow_scans(_usable(scans, seconds), times=times, **limits):
+    for pose in follow_scans(
+        _usable(scans, seconds),
+        times=times,
+        max_range_m=max_range_m,
+        min_range_m=min_range_m,
+        voxel_m=voxel_m,
+    ):
         poses.append(pose)
         if progress:
             progress(len(poses), total or len(poses))
@@ -87,6 +116,8 @@ def follow_scans(
     times: Sequence[float] | AnyFloatArray | None = None,
     max_range_m: float = 100.0,
     min_range_m: float = 0.0,
+    voxel_m: float | None = None,
+    note: Callable[[str], object] = lambda line: None,
 ) -> Iterator[Transform]:
     """Yield the pose of every scan of a drive, in order, as soon as it is known.
 
@@ -113,6 +144,8 @@ def follow_scans(
             may grow during the run, if it has the time of a scan before the scan is read.
         max_range_m: farther points are not used.
         min_range_m: nearer points are not used.
+        voxel_m: size of the voxels in which points are thinned; None: by the distances of points.
+        note: called with what was chosen, one line.
 
     Yields:
         (4, 4) first_T_sensor.
@@ -127,19 +160,77 @@ def follow_scans(
     config.registration.max_num_threads = (
         1  # several threads sum in a different order each time, which changes the last digits
     )
-    config.mapping.voxel_size = max_range_m / 100.0
     scans = iter(scans)
     start = list(islice(scans, _START))
-    begin = partial(pipeline.KissICP, config)
-    yield from _follow(
-        begin(), enumerate(chain(start, scans)), times, _find_start(start, times, begin)
-    )
+    near, reach_m, chosen_m = _look(start)
+    chosen_m = voxel_m or (chosen_m if near else max_range_m / 100.0)
+    config.mapping.voxel_size = max_range_m / 100.0 if near else chosen_m
+    begin: Callable[[], Any] = partial(pipeline.KissICP, config)
+    motion = _find_start(start, times, begin, np.eye(4))
+    if near:
+        begin = partial(_PlaneOdometry, min_range_m, max_range_m, chosen_m)
+        motion = _find_start(start, times, begin, motion)
+        reach_m = min(reach_m, max_range_m)
+        note(f"odometry by planes: points within {reach_m:.0f} m, in voxels of {chosen_m:.2g} m")
+    elif voxel_m:
+        note(f"odometry: points within {max_range_m:g} m, in voxels of {voxel_m:g} m")
+    yield from _follow(begin(), enumerate(chain(start, scans)), times, motion)
+
+
+def _look(start: Sequence[UsableScan]) -> tuple[bool, float, float]:
+    """Return whether the first scans are of no street, how far their points reach, and the size of
+    voxels that fits these, metres.
+    """
+    heights = np.array([-ground_height(points) for points, _ in start])
+    away = np.concatenate([np.ones(1), *(lengths(points) for points, _ in start)])
+    half, most, reach = np.quantile(away, (0.5, _FAR[0], 0.99)).tolist()
+    low = (heights > _VEHICLE_M[0]) & (heights < _VEHICLE_M[1])
+    voxel_m = round(min(max(half / _VOXELS, _FINE_M), _COARSE_M), 2)
+    return not (most > _FAR[1] and 2 * low.sum() > len(start)), reach, voxel_m
+
+
+class _PlaneOdometry:
+    """Aligns each scan to the planes of the scans before; has what is used of KISS-ICP's API."""
+
+    repeats = 2  # how often a scan is registered: it is deskewed by its own motion
+
+    def __init__(self, min_range_m: float, max_range_m: float, voxel_m: float) -> None:
+        self._limits, self._voxel_m = (min_range_m, max_range_m), voxel_m
+        self._scans: list[AnyFloatArray] = []
+        self._poses: list[Transform] = []
+        self.local_map, self.last_pose, self.last_delta = self, np.eye(4), np.eye(4)
+
+    def point_cloud(self) -> Sequence[AnyFloatArray]:
+        """Return the scans."""
+        return self._scans
+
+    def forget_last(self) -> None:
+        """Undo the registration of the last scan, but not what is known of its motion."""
+        del self._scans[-1], self._poses[-1]
+        self.last_pose = self.last_pose @ invert(self.last_delta)
+
+    def register_frame(self, points: FloatArray, _: FloatArray) -> None:
+        """Register (N, 3) points; `last_delta` is the prediction."""
+        used = points.astype(np.float32)
+        away = lengths(used)
+        used = used[(away >= self._limits[0]) & (away <= self._limits[1])]
+        cells = np.floor(used / np.float32(self._voxel_m)).astype(np.int64)
+        self._scans.append(used[first_of_cells(cells)])
+        before, poses = self.last_pose, [*self._poses, self.last_pose @ self.last_delta]
+        start = np.stack(poses)
+        aligned = align(self._scans, start, start, len(self._poses), _PASSES)[-1:]
+        # exactly rigid: errors would double with each scan
+        self.last_pose = poses_from(quaternions_of(aligned[:, :3, :3]), aligned[:, :3, 3])[0]
+        self.last_delta = invert(before) @ self.last_pose
+        self._poses.append(self.last_pose)
+        del self._scans[:-_HELD], self._poses[:-_HELD]
 
 
 def _find_start(
     start: Sequence[UsableScan],
     times: Sequence[float] | AnyFloatArray | None,
     begin: Callable[[], Any],
+    motion: Transform,
 ) -> Transform:
     """Return the motion from the first scan to the next one: `first_T_second`.
 
@@ -147,8 +238,9 @@ def _find_start(
         start: the first scans.
         times: of the frames.
         begin: makes a new odometry.
+        motion: the first guess.
     """
-    numbered, motion = list(enumerate(start)), np.eye(4)
+    numbered = list(enumerate(start))
     for back in (False, True):  # forwards and backwards over the first scans
         odometry = begin()
         for _ in _follow(
@@ -270,19 +362,24 @@ def _register(
         before_T_scan of this scan.
     """
     points, seconds = scan
-    if seconds is not None:
-        at, tick_of = ticks_of(-seconds if back else seconds)
-        moved = slerp(
-            np.stack([invert(motion), np.eye(4), motion]),
-            np.array([-1.0, 0.0, 1.0]) * elapsed_s,
-            at,
-        )
-        points = move_each(points, moved, tick_of)
     if not len(odometry.local_map.point_cloud()):
         odometry.last_pose = invert(motion)  # so that the first scan is at the origin
-    odometry.last_delta = motion
-    odometry.register_frame(np.ascontiguousarray(points, np.float64), np.zeros(0))
-    return np.array(odometry.last_delta)
+    for repeat in range(1 if seconds is None else getattr(odometry, "repeats", 1)):
+        if repeat:
+            odometry.forget_last()
+        points = scan[0]
+        if seconds is not None:
+            at, tick_of = ticks_of(-seconds if back else seconds)
+            moved = slerp(
+                np.stack([invert(motion), np.eye(4), motion]),
+                np.array([-1.0, 0.0, 1.0]) * elapsed_s,
+                at,
+            )
+            points = move_each(points, moved, tick_of)
+        odometry.last_delta = motion
+        odometry.register_frame(np.ascontiguousarray(points, np.float64), np.zeros(0))
+        motion = np.array(odometry.last_delta)
+    return motion
 
 
 def _elapsed(times: Sequence[float] | AnyFloatArray | None, number: int) -> float:

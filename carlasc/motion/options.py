@@ -23,18 +23,27 @@ class PoseOptions:
             none. The given poses are not overwritten.
         force: accept poses even if they jump between frames, if scans do not overlap under them, or
             if their calibration is missing.
+        odometry_voxel_m: size of the voxels in which estimation thins points, in metres. None: by
+            the distances of the points.
 
     Raises:
-        ArgumentError: an unknown value.
+        ArgumentError: an unknown value, or a size that is not positive.
     """
 
     source: PoseSource = "auto"
     refine: RefineMode = "auto"
     force: bool = False
+    odometry_voxel_m: float | None = None
 
     def __post_init__(self) -> None:
         check_choice("poses", self.source, PoseSource)
         check_choice("refine", self.refine, RefineMode)
+        if self.odometry_voxel_m is not None and not self.odometry_voxel_m > 0:
+            raise ArgumentError(
+                "odometry_voxel_m",
+                expected="a positive number of metres",
+                found=str(self.odometry_voxel_m),
+            )
 
 
 @dataclass(frozen=True)

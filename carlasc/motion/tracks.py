@@ -339,8 +339,13 @@ class MovingActors:
     def is_own(self, points: AnyFloatArray) -> BoolArray:
         """Return which of (N, 3) points, metres, sensor frame, are on the recording vehicle."""
         own = np.zeros(len(points), np.bool_)
-        for corners in self.own:
-            own |= ((points >= corners[:3]) & (points <= corners[3:])).all(axis=1)
+        if not self.own:
+            return own
+        corners = np.stack(self.own)
+        reach = np.abs(corners).max()
+        near = np.flatnonzero((np.abs(points) <= reach).all(axis=1))
+        for lower, upper in corners.reshape(-1, 2, 3):
+            own[near] |= ((points[near] >= lower) & (points[near] <= upper)).all(axis=1)
         return own
 
     def to_bytes(self, key: str) -> bytes:

@@ -150,7 +150,12 @@ class _RefinedSequence(DerivedSequence):
     """
 
     def __init__(
-        self, whole: Sequence, posed: Sequence, change: RefinedPoses, corrected: str = ""
+        self,
+        whole: Sequence,
+        posed: Sequence,
+        change: RefinedPoses,
+        corrected: str = "",
+        turned: str = "",
     ) -> None:
         estimated = posed is not whole and not corrected
         self.scans = len(change.refined) if corrected else int(change.refined.sum())
@@ -161,7 +166,10 @@ class _RefinedSequence(DerivedSequence):
         words = [word for word in words if word != _LEFT]
         if _REFINED not in words:
             words.append(_REFINED if self.scans else _LEFT)
-        self.note = "; ".join([*notes, *_notes(change, whole.frames("points"))])
+        notes += _notes(change, whole.frames("points"))
+        if turned:
+            notes.append(f"the sensor is turned in their frame, which was not changed: {turned}")
+        self.note = "; ".join(notes)
         extra = {**whole.metadata.extra, "poses": ", ".join(words)}
         texts = {layout.METADATA: replace(whole.metadata, extra=extra).to_json()}
         if self.scans or estimated or corrected:
@@ -181,24 +189,30 @@ def _refine(
     """
     posed = sequence
     if estimated := must_estimate(sequence, options):
-        posed = with_estimated_poses(sequence)
+        posed = with_estimated_poses(sequence, options)
         check_trajectory(posed, options)
     feed = ScanFeed(posed, options)
     change = refine_sequence(feed, writer, run, step)
     # estimated poses are poses of the sensor
     mounting = None if estimated else _mounting(feed, change)
-    if mounting is None or not mounting.wrong.any():
-        return _RefinedSequence(sequence, posed, change)
+    turned = "" if mounting is None else _named(mounting, slice(3, 6))
+    if mounting is None or not mounting.is_moved:
+        return _RefinedSequence(sequence, posed, change, turned=turned)
     seconds = np.array(list(feed.times.values()))
     mounted = replace(
         change, poses=mounting.correct(change.given, seconds), refined=np.ones_like(change.refined)
     )
     corrected = with_refined_poses(posed, feed.frames, mounted)
     change = refine_sequence(feed.with_poses_of(corrected), writer, run)
-    offsets = zip(mounting.describe().items(), mounting.wrong, strict=True)
-    wrong = ", ".join(f"{name} {value}" for (name, value), is_wrong in offsets if is_wrong)
-    note = f"poses were corrected for the sensor in their frame: {wrong}"
-    return _RefinedSequence(sequence, corrected, change, note)
+    moved = ", ".join(filter(None, (_named(mounting, slice(3)), _named(mounting, slice(6, 7)))))
+    note = f"poses were corrected for the sensor in their frame: {moved}"
+    return _RefinedSequence(sequence, corrected, change, note, turned)
+
+
+def _named(mounting: Mounting, rows: slice) -> str:
+    """Return the wrong ones of some values, in words."""
+    values = list(zip(mounting.describe().items(), mounting.wrong, strict=True))[rows]
+    return ", ".join(f"{name} {value}" for (name, value), is_wrong in values if is_wrong)
 
 
 def _mounting(feed: ScanFeed, change: RefinedPoses) -> Mounting | None:

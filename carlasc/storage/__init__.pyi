@@ -1,6 +1,8 @@
 from .camera_files import cameras_of as cameras_of
 from .camera_files import read_image as read_image
 from .camera_files import scan_T_camera as scan_T_camera
+from .class_files import read_classes as read_classes
+from .class_files import read_remap as read_remap
 from .copying import unpack as unpack
 from .downloading import download as download
 from .folder import FolderSink as FolderSink

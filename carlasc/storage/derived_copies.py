@@ -12,7 +12,8 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -21,12 +22,13 @@ from typing import Any
 import numpy as np
 
 from carlasc.core.arrays import AnyArray, IntArray
-from carlasc.errors import ConflictError, MissingDataError
+from carlasc.errors import CarlascError, CompleteError, ConflictError, MissingDataError
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.copying import UnpackResult, refuse_overlap, unpack
 from carlasc.storage.files import (
     AnyPath,
+    has_content,
     make_folder,
     replaced,
     sync_all,
@@ -43,6 +45,7 @@ from carlasc.storage.transport.trees import is_url
 from carlasc.storage.views import ChosenSequences, SequenceView
 
 _MOST_UNREAD = 64  # frames
+_RECORD = layout.record_file("copy")  # of the input and options, in the finished copy
 
 
 @dataclass
@@ -193,16 +196,20 @@ class DerivedCopy:
         Raises:
             ConflictError: something at `out` may not be replaced, `out` lies inside `source`, or an
                 interrupted run had another input or other options.
+            CompleteError: `out` is the copy that this call would make.
         """
         run.part.refuse(overwrite)
         refuse_overlap(out, source)
         self.source, self.out, self.overwrite = source, out, overwrite
         self.mark: Path | None = None
         if not is_url(out) and run.part.count == 1:
-            _clear(Path(out), kind, is_kind, overwrite=overwrite)
             inputs = sequence_states(source)
             settings = {"source": source.location, "kind": kind, "inputs": inputs, **made_from}
-            self.mark = _mark(unfinished(Path(out)), settings, overwrite=overwrite)
+            if not overwrite and has_content(record := Path(out) / _RECORD):
+                check_complete(out, record.read_bytes() == to_json(settings))
+            _clear(Path(out), kind, is_kind, overwrite=overwrite)
+            with _naming_replaced(Path(out)):
+                self.mark = _mark(unfinished(Path(out)), settings, overwrite=overwrite)
 
     def writer(self, path: str) -> SequenceWriter | None:
         """Return the writer for data derived from a sequence, kept until the copy is complete; None
@@ -225,10 +232,13 @@ class DerivedCopy:
             folder = Path(self.out) if self.mark is None else unfinished(Path(self.out))
             linked = sum(_link_files(one, folder / path) for path, one in sequences.items())
         chosen = ChosenSequences(self.source.location, sequences)
-        copied = unpack(chosen, self.out, overwrite=self.overwrite and self.mark is None, run=run)
+        aside = self.overwrite and self.mark is None
+        with _naming_replaced(Path(self.out)):
+            copied = unpack(chosen, self.out, overwrite=aside, run=run)
         if self.mark is not None:
             for path in sequences:
                 shutil.rmtree(Path(self.out) / path / layout.DERIVED, ignore_errors=True)
+            write_atomic(Path(self.out) / _RECORD, self.mark.read_bytes())
             self.mark.unlink(missing_ok=True)
             if self.overwrite:
                 remove(replaced(Path(self.out)))
@@ -238,6 +248,29 @@ class DerivedCopy:
             linked=linked,
             left_out=sorted({name for one in sequences.values() for name in one.left_out}),
         )
+
+
+@contextmanager
+def _naming_replaced(out: Path) -> Iterator[None]:
+    """Say in errors where the older copy is that was moved aside."""
+    try:
+        yield
+    except CarlascError as error:
+        if replaced(out).exists() and not out.exists():
+            where = f"the data set that was in {out.name} is in {replaced(out)}"
+            error.advice = "; ".join(part for part in (error.advice, where) if part)
+        raise
+
+
+def check_complete(out: AnyPath, is_complete: bool) -> None:
+    """Say that an output needs no work.
+
+    Raises:
+        CompleteError: it is complete.
+    """
+    if is_complete:
+        problem, advice = "it is complete, and nothing changed", "`overwrite=True` makes it again"
+        raise CompleteError(out, problem=problem, advice=advice)
 
 
 def _clear(out: Path, kind: str, is_kind: Callable[[Metadata], bool], *, overwrite: bool) -> None:

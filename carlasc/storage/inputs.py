@@ -18,13 +18,13 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from hashlib import blake2b
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from carlasc.core.arrays import AnyArray
 from carlasc.core.choices import CompareInputs
-from carlasc.core.plain import from_plain
-from carlasc.errors import CarlascError, count, first_names, reading
+from carlasc.errors import CarlascError, count, first_names, first_runs
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
@@ -32,6 +32,11 @@ from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 from carlasc.storage.transport.trees import Tree
 
+UNKNOWN = (
+    "there is no record of what existing frames were made from: they are kept; "
+    '`compare_inputs="content"` compares them'
+)
+"""The note on outputs of an older version, or whose record was deleted."""
 _FORMAT = 1
 _BYTES = 16  # of the digest of a file
 _SHORT = 8  # bytes of the digests in records
@@ -190,26 +195,36 @@ def _states(files: FrameFiles, frames: list[int]) -> dict[int, str]:
     }
 
 
-def sequence_states(source: Source) -> dict[str, str]:
-    """Return the state of the text files and the scans of each sequence of a source, by path."""
+def sequence_states(source: Source, *more: str) -> dict[str, str]:
+    """Return the state of the text files, the scans and the pictures of each sequence of a source,
+    by path, and of more fields.
+    """
     states = {}
     for path, sequence in source.sequences().items():
-        files = SequenceFiles(sequence, *(name for name in sequence.fields() if "/" not in name))
-        own = _states(files, sequence.scan_frames().tolist())
+        own = [name for name in sequence.fields() if "/" not in name]
+        files = SequenceFiles(sequence, *own, *more)
         texts = [(name, sequence.read_document(name)) for name in sequence.documents()]
-        states[path] = combined(own, [text for text in texts if "/" not in text[0]])
+        states[path] = combined(
+            _states(files, sequence.scan_frames().tolist()),
+            [text for text in texts if "/" not in text[0]],
+        )
     return states
 
 
 def _read_rows(writer: SequenceWriter, document: str) -> dict[int, tuple[str, str]]:
     """Return the rows of a table of digests; empty without one, or with one of another version."""
+    with suppress(KeyError, ValueError, TypeError, AttributeError):
+        rows = _read_record(writer, document)["frames"]
+        return {int(frame): (state, digest) for frame, (state, digest) in rows.items()}
+    return {}
+
+
+def _read_record(writer: SequenceWriter, document: str) -> dict[str, Any]:
+    """Return the content of a record; empty without one, or with one of another version."""
     data = writer.read_document(document)
     with suppress(CarlascError):
         values = {} if data is None else parse_json(data, document)
-        if values.get("format") == _FORMAT:
-            with reading(document, "a table of digests"):
-                rows = from_plain(values["frames"], dict[str, tuple[str, str]], "frames")
-                return {int(frame): row for frame, row in rows.items()}
+        return values if values.pop("format", None) == _FORMAT else {}
     return {}
 
 
@@ -222,26 +237,21 @@ class MadeFrom:
         own: digest of the own files, the pose and the time of each frame of the input.
         frames: digest of everything that a frame of the output was made from; empty while a frame
             that exists is made again.
-        replaced: frames whose scans are written again, because those of the input changed.
     """
 
     whole: str = ""
     own: dict[str, str] = field(default_factory=dict)
     frames: dict[str, str] = field(default_factory=dict)
-    replaced: tuple[int, ...] = ()
 
     @classmethod
     def read(cls, writer: SequenceWriter, output: str) -> MadeFrom:
         """Return the record of an output; an empty one without any, or with one that cannot be
         read.
         """
-        name = layout.record_file(output)
-        data = writer.read_document(name)
-        with suppress(CarlascError):
-            values = {} if data is None else parse_json(data, name)
-            if values.pop("format", None) == _FORMAT:
-                with reading(name, "a record of inputs"):
-                    return from_plain(values, cls, "record")
+        with suppress(KeyError, ValueError, TypeError, AttributeError):
+            values = _read_record(writer, layout.record_file(output))
+            frames = {str(int(frame)): str(made) for frame, made in values["frames"].items()}
+            return cls(str(values["whole"]), dict(values["own"]), frames)
         return cls()
 
     def write(self, writer: SequenceWriter, output: str) -> None:
@@ -297,24 +307,12 @@ def describe_changes(old: Mapping[str, str], new: Mapping[str, str]) -> str:
     kinds = {
         "changed": [int(frame) for frame in new.keys() & old.keys() if new[frame] != old[frame]],
         "added": list(map(int, new.keys() - old.keys())),
-        "removed": list(map(int, old.keys() - new.keys())),
+        "removed": [int(frame) for frame in old.keys() - new.keys() if frame.isdecimal()],
     }
-    parts = [f"{_named(frames)} {kind}" for kind, frames in kinds.items() if frames]
-    return ", ".join(parts)
-
-
-def _named(frames: Collection[int]) -> str:
-    """Return "scan 12", or "scans 3, 7 to 9 and 20 more"."""
-    spans = list[list[int]]()
-    for frame in sorted(frames):
-        if spans and frame == spans[-1][1] + 1:
-            spans[-1][1] = frame
-        else:
-            spans.append([frame, frame])
-    texts = [str(a) if a == b else f"{a} to {b}" for a, b in spans[:_NAMED]]
-    left = len(frames) - sum(b - a + 1 for a, b in spans[:_NAMED])
-    return f"scan{'s' * (len(frames) > 1)} {', '.join(texts)}" + (
-        f" and {left} more" if left else ""
+    return ", ".join(
+        f"scan{'s' * (len(frames) > 1)} {first_runs(sorted(frames), _NAMED)} {kind}"
+        for kind, frames in kinds.items()
+        if frames
     )
 
 

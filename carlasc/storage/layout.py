@@ -346,6 +346,15 @@ class Metadata:
         return self.extra.get("rays") is not False
 
     @property
+    def height_m(self) -> float | None:
+        """Height of the first sensor above the ground; None if it is not known."""
+        sensors = self.extra.get("sensors")
+        first = sensors[0] if isinstance(sensors, list) and sensors else None
+        height: Any = first.get("height_m") if isinstance(first, dict) else None
+        is_number = isinstance(height, int | float) and not isinstance(height, bool)
+        return float(height) if is_number else None
+
+    @property
     def predicted(self) -> str | None:
         """The key `labels`, "predicted by ...", if labels are predicted; otherwise None."""
         labels = self.extra.get("labels")

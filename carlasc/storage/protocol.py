@@ -9,6 +9,7 @@ needs a handle opens it in each process on the first read.
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Collection, ItemsView, Iterable, Iterator, Mapping, ValuesView
@@ -85,6 +86,7 @@ class Sequence(ABC):
     tree: FileTree | None = None
     awaited: frozenset[int] = frozenset()
     _given_poses: FloatArray | None = None
+    _given_classes: ClassTable | None = None
 
     @abstractmethod
     def fields(self) -> frozenset[str]:
@@ -204,6 +206,8 @@ class Sequence(ABC):
             FormatError: carlasc.json or params.json names an unknown table, or contains an invalid
                 one.
         """
+        if self._given_classes is not None:
+            return self._given_classes
         table = self._record(grid).get("classes")
         if table is None:
             return self.metadata.classes
@@ -214,6 +218,8 @@ class Sequence(ABC):
         params.json of the grid names it; otherwise that of CARLA is assumed, as published files
         have it.
         """
+        if self._given_classes is not None:
+            return TableUse(self._given_classes.name, "option")
         name, table = layout.METADATA, self.classes_of(grid) if grid else self.metadata.classes
         named = bool(grid) and self._record(grid).get("classes") is not None
         if not named and name in self.documents():
@@ -239,6 +245,15 @@ class Sequence(ABC):
             record.get("format", 1), f"{self.location}/{layout.params_file(grid)}: carlasc"
         )
         return record
+
+    def with_classes(self, classes: ClassTable) -> Sequence:
+        """Return a copy of the sequence whose labels, of points and of grids, are read with another
+        class table than the metadata name.
+        """
+        other = copy.copy(self)
+        vars(other)["metadata"] = dataclasses.replace(self.metadata, classes=classes)
+        other._given_classes = classes
+        return other
 
     def with_poses(self, poses: FloatArray) -> Self:
         """Return a copy of the sequence with other poses than those in its poses.txt.

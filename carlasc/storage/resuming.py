@@ -152,7 +152,9 @@ def _first_difference(existing: dict[str, Any], wanted: dict[str, Any]) -> str |
     return None
 
 
-def agree_lines(writer: SequenceWriter, document: str, ours: FloatArray | None) -> bytes | None:
+def agree_lines(
+    writer: SequenceWriter, document: str, ours: FloatArray | None, *, is_whole: bool = False
+) -> bytes | None:
     """Return the poses.txt or times.txt to write; None if there is nothing to write.
 
     Existing lines must be equal to those of this run. Lines without a pose (NaN: it could not be
@@ -162,6 +164,7 @@ def agree_lines(writer: SequenceWriter, document: str, ours: FloatArray | None) 
         writer: writes the sequence.
         document: name of the file.
         ours: (F, 4, 4) first_T_sensor, or (F,) seconds, of this run; None if it has none.
+        is_whole: whether more lines of an earlier run are left out.
 
     Raises:
         ConflictError: an existing line is different; the message names the frame.
@@ -179,6 +182,7 @@ def agree_lines(writer: SequenceWriter, document: str, ours: FloatArray | None) 
         raise _other_data(where, int(np.argwhere(differs)[0, 0]))
     merged = np.concatenate([existing, ours[both:]])
     merged[:both] = np.where(np.isnan(existing[:both]), ours[:both], existing[:both])
+    merged = merged[: len(ours)] if is_whole else merged
     return None if np.array_equal(merged, existing, equal_nan=True) else encode(merged)
 
 

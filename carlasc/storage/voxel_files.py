@@ -7,7 +7,6 @@ A format is an entry point of the group `carlasc.voxels`, whose value is a `Voxe
 from __future__ import annotations
 
 import copy
-import fnmatch
 import os
 import re
 from abc import ABC, abstractmethod
@@ -15,19 +14,20 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 
 from carlasc.core.arrays import AnyArray, BoolArray, FloatArray, IntArray, LabelArray
-from carlasc.core.classes import ClassTable, TableUse, times
+from carlasc.core.classes import ClassTable, TableUse, tables_with, times
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLASC11, table_to_json
 from carlasc.errors import FormatError, MissingDataError, load_plugin, plugin_names
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
 from carlasc.storage.layout import Metadata
-from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.protocol import Sequence
+from carlasc.storage.views import ChosenSequences
 
 SeenBy = Literal["lidar", "camera"]
 """Whose mask of observed voxels is taken, for data that have both."""
@@ -36,6 +36,13 @@ _Read = Callable[[Path], LabelArray]
 GROUP = "carlasc.voxels"
 IGNORED_ID = 255  # in files of other programs: a voxel that does not count
 _BITS = 8  # voxels per byte of an .invalid file
+
+
+def is_counted(labels: LabelArray, table: ClassTable) -> BoolArray:
+    """Return the voxels, of any shape, that do not have the id of ignored ones in files of other
+    programs; in the raw ids of SemanticKITTI, this id is a class.
+    """
+    return (labels != IGNORED_ID) | (IGNORED_ID in table.names)
 
 
 class GridFrames(ABC):
@@ -101,10 +108,10 @@ class VoxelFormat:
             first. A template such as "sequences/{sequence}/voxels/{frame}.label" has a name for
             each changing part, perhaps with a pattern: "{sequence=scene_*}". Without {sequence},
             the folder is one sequence.
-        classes: class table of the ids in files.
-        spec: geometry.
+        classes: class table of the ids in files; None if it is not known.
+        spec: geometry; None if it is not known.
         read: function that returns the (X, Y, Z) ids of a file; 255 is an ignored voxel. None for
-            `.label` files, which `LabelFolder` reads.
+            `.label` files, which `LabelFrames` reads.
         mask: function that returns the (X, Y, Z) bool mask of the voxels that the LiDAR or a camera
             observed, or None if the file has no such mask. None if no file has one.
         holds: function that returns whether a file has the format, for templates whose names also
@@ -114,15 +121,16 @@ class VoxelFormat:
         benchmark: name of the convention that scores the files; a second name is for files without
             camera masks.
         place: frame of the grid in words.
-        origin: position of the LiDAR in the grid, metres.
+        y_forward: whether the vehicle drives in the direction of y; otherwise in that of x.
+        origin: position of the LiDAR in the grid, metres; None if it is not known.
         poses: function that returns (F, 4, 4) poses of the grid in one fixed frame, given the
-            folder of a sequence and the names of its frames; None if they are not known.
+            folder of its files and the names of its frames; None if they are not known.
     """
 
     name: str
     files: Mapping[str, str]
-    classes: ClassTable
-    spec: GridSpec
+    classes: ClassTable | None
+    spec: GridSpec | None
     read: _Read | None = None
     mask: Callable[[Path, SeenBy], BoolArray | None] | None = None
     holds: Callable[[Path], bool] | None = None
@@ -130,6 +138,7 @@ class VoxelFormat:
     named: str = "format"
     benchmark: tuple[str, ...] = ()
     place: str = "the sensor, x forward"
+    y_forward: bool = False
     origin: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
     poses: Callable[[Path, list[str]], FloatArray | None] | None = None
 
@@ -137,24 +146,18 @@ class VoxelFormat:
         """Yield the grids at a place, each with its name: a folder above the files, a folder of
         some of them, or one file.
         """
+        kind, seen = LabelFrames if self.read is None else VoxelFrames, set[Path]()
         for grid, template in self.files.items():
+            depth = template.partition("{frame")[2].count("/")
             found: dict[tuple[str, Path], dict[str, Path]] = {}
             for path, names in matches(place, template):
-                folder = place if place.is_dir() and "sequence" not in names else path.parent
-                if "sequence" in names:
-                    depth = template.count("/") - template[: template.index("{sequence")].count("/")
-                    folder = path.parents[depth - 1]
-                found.setdefault((names.get("sequence", ""), folder), {})[names["frame"]] = path
+                if path not in seen:
+                    key = names.get("sequence", ""), path.parents[depth]
+                    found.setdefault(key, {})[names["frame"]] = path
+                    seen.add(path)
             for (sequence, folder), files in sorted(found.items()):
-                if self.holds is not None and not self.holds(next(iter(files.values()))):
-                    continue
-                if self.read is None:
-                    labels = next(iter(files.values())).parent
-                    frames: GridFrames = LabelFolder(labels, sequence, self, frozenset(files))
-                else:
-                    frames = VoxelFrames(self, self.read, folder, sequence, files)
-                if len(frames.frames()):
-                    yield grid, frames
+                if self.holds is None or self.holds(next(iter(files.values()))):
+                    yield grid, kind(self, folder, sequence, files)
 
 
 class VoxelFrames(GridFrames):
@@ -165,19 +168,18 @@ class VoxelFrames(GridFrames):
 
     Attributes:
         format: format of the files.
-        read: function that returns the (X, Y, Z) ids of a file.
         files: file of each frame, by name.
         names: names of the frames in order.
     """
 
     def __init__(
-        self, format: VoxelFormat, read: _Read, folder: Path, path: str, files: dict[str, Path]
+        self, format: VoxelFormat, folder: Path, path: str, files: Mapping[str, Path]
     ) -> None:
-        self.format, self.read = format, read
-        self.path, self.location, self.files = path, str(folder), files
+        """Keep the files, which are in `folder` or in folders of their frames in it."""
+        self.format, self.path, self.location = format, path, str(folder)
         self.classes, self.named, self.origin = format.classes, format.named, format.origin
-        self.spec: GridSpec = format.spec
-        self.names = sorted(files)
+        self.spec = format.spec
+        self.files, self.names = files, sorted(files)
 
     @cached_property
     def numbered(self) -> bool:
@@ -192,40 +194,42 @@ class VoxelFrames(GridFrames):
         return first if masked else others[0]
 
     def follow(self, truth: GridFrames) -> None:
-        """Take the numbering of frames from the ground truth."""
-        if isinstance(truth, VoxelFrames):
+        """Take the numbering of frames from the ground truth, unless both have numbers."""
+        if isinstance(truth, VoxelFrames) and not (self.numbered and truth.numbered):
             self.names, self.numbered = truth.names, truth.numbered
+            vars(self).pop("_name", None)
 
     def only(self, names: list[str]) -> VoxelFrames:
         """Return the frames with these names."""
         files = {name: self.files[name] for name in names}
-        return VoxelFrames(self.format, self.read, Path(self.location), self.path, files)
-
-    def frames(self) -> IntArray:
-        """Return the numbers of the frames that have a file."""
-        names = enumerate(self.names)
-        return np.array(
-            [int(n) if self.numbered else i for i, n in names if n in self.files], np.int64
-        )
+        return VoxelFrames(self.format, Path(self.location), self.path, files)
 
     @cached_property
     def _name(self) -> dict[int, str]:
         return {int(n) if self.numbered else i: n for i, n in enumerate(self.names)}
 
+    def frames(self) -> IntArray:
+        """Return the numbers of the frames that have a file."""
+        return np.array([i for i, name in self._name.items() if name in self.files], np.int64)
+
     def name_of(self, frame: int) -> str:
         """Return the name of a frame's file."""
         return str(frame) if self.numbered else self._name[frame]
 
+    def file_of(self, frame: int) -> Path:
+        """Return the file of a frame."""
+        return self.files[self._name[frame]]
+
     def labels(self, frame: int) -> LabelArray:
         """Return (X, Y, Z) ids as they are in the file."""
-        return self.read(self.files[self._name[frame]])
+        return cast("_Read", self.format.read)(self.file_of(frame))
 
     def known(self, frame: int, seen_by: SeenBy = "lidar") -> BoolArray | None:
         """Return (X, Y, Z) bool, the voxels that the LiDAR or a camera observed; None if the file
         does not contain the mask.
         """
         mask = self.format.mask
-        return None if mask is None else mask(self.files[self._name[frame]], seen_by)
+        return None if mask is None else mask(self.file_of(frame), seen_by)
 
     def poses(self) -> FloatArray | None:
         """Return (F, 4, 4) poses of the grid; None if the folders hold none."""
@@ -233,8 +237,8 @@ class VoxelFrames(GridFrames):
         return None if poses is None else poses(Path(self.location), self.names)
 
 
-class LabelFolder(GridFrames):
-    """A folder of `000000.label` files without params.json, as other tools write it.
+class LabelFrames(VoxelFrames):
+    """The frames of a folder of `000000.label` files without params.json.
 
     The folder may also have counts (`000000.bin`, float32), or masks of SemanticKITTI or SSCBench
     (`000000.invalid`, one bit or one byte per voxel). Labels are uint32, as in the layout, or
@@ -243,73 +247,34 @@ class LabelFolder(GridFrames):
     counts by its size.
 
     Attributes:
-        format: format of the files; None for a plain folder.
         voxels: number of voxels per frame; None if it is not known.
     """
 
     def __init__(
-        self,
-        folder: Path,
-        path: str = "",
-        format: VoxelFormat | None = None,
-        names: frozenset[str] | None = None,
+        self, format: VoxelFormat, folder: Path, path: str, files: Mapping[str, Path]
     ) -> None:
-        """Keep the folder. `names` are the only frames; None takes all of the folder."""
-        self.folder, self.path, self.location = folder, path, str(folder)
-        self.format, self._names = format, names
-        self.spec, self.classes = None, None
-        # bytes per label if the number of voxels is not known
-        self._width = 4 if format is None else format.label_bytes
-        self.voxels = self._count_voxels(int(self.frames()[0])) if len(self.frames()) else None
-        if format is None:
-            return
-        self.classes, self.named, self.origin = format.classes, format.named, format.origin
-        self.benchmark = next(iter(format.benchmark), None)
-        if self.voxels is None and len(frames := self.frames()):
-            self.voxels = self._file(int(frames[0]), ".label").stat().st_size // self._width
-        if self.voxels == format.spec.num_voxels:
-            self.spec = format.spec
-
-    def _count_voxels(self, frame: int) -> int | None:
-        """Return the number of voxels from the sizes of the files of a frame; None if only labels
-        exist.
-        """
-        if (counts := self._counts(frame)) is not None:
-            return counts.stat().st_size // 4
-        if (invalid := self._file(frame, ".invalid")).is_file():
-            size = invalid.stat().st_size
-            # because labels have two or four bytes per voxel
-            packed = self._file(frame, ".label").stat().st_size >= size * _BITS
-            return size * _BITS if packed else size
-        return None
-
-    def _counts(self, frame: int) -> Path | None:
-        """Return the file of counts of a frame, with four bytes per voxel; None if it does not
-        exist.
-        """
-        counts, labels = self._file(frame, ".bin"), self._file(frame, ".label")
-        if not counts.is_file() or self._file(frame, ".invalid").is_file():
-            return None
-        return counts if counts.stat().st_size >= labels.stat().st_size else None
+        """Keep the files. The geometry is that of the format if the size of the first file fits."""
+        super().__init__(format, folder, path, files)
+        first = files[self.names[0]]
+        size, invalid = first.stat().st_size, first.with_suffix(".invalid")
+        self.voxels: int | None = None
+        if (counts := _counts_of(first)) is not None:
+            self.voxels = counts.stat().st_size // 4
+        elif invalid.is_file():
+            self.voxels = invalid.stat().st_size
+            if size >= self.voxels * _BITS:  # because labels have two or four bytes per voxel
+                self.voxels *= _BITS
+        elif self.spec is not None:
+            self.voxels = size // format.label_bytes
+        if self.spec is not None and self.voxels != self.spec.num_voxels:
+            self.spec = None
 
     def follow(self, truth: GridFrames) -> None:
         """Take the number of voxels from the ground truth."""
         if truth.spec is not None:
             self.voxels = truth.spec.num_voxels
-        elif isinstance(truth, LabelFolder) and truth.voxels is not None:
+        elif isinstance(truth, LabelFrames) and truth.voxels is not None:
             self.voxels = truth.voxels
-
-    @cached_property
-    def _frames(self) -> IntArray:
-        names = os.listdir(self.folder)
-        if self._names is not None:
-            names = [f"{name}.label" for name in self._names]
-        numbers = [layout.frame_of(name, ".label") for name in names]
-        return np.array(sorted(number for number in numbers if number is not None), np.int64)
-
-    def frames(self) -> IntArray:
-        """Return the sorted frames that have a `.label` file."""
-        return self._frames
 
     def labels(self, frame: int) -> LabelArray:
         """Return (X * Y * Z,) labels.
@@ -317,19 +282,15 @@ class LabelFolder(GridFrames):
         Raises:
             FormatError: the file size does not fit a grid.
         """
-        path = self._file(frame, ".label")
+        path, usual = self.file_of(frame), self.format.label_bytes
         size = path.stat().st_size
         types: dict[float, np.dtype[np.unsignedinteger]] = {2: np.dtype("<u2"), 4: np.dtype("<u4")}
-        width = self._width if self.voxels is None else size / max(self.voxels, 1)
+        width = usual if self.voxels is None else size / max(self.voxels, 1)
         if width not in types or size % width:
-            expected = (
-                f"labels of {self._width} bytes"
-                if self.voxels is None
-                else f"{self.voxels} labels of 2 or 4 bytes"
-            )
+            expected = f"{self.voxels} labels of 2 or 4 bytes"
             raise FormatError(
                 path,
-                expected=expected,
+                expected=f"labels of {usual} bytes" if self.voxels is None else expected,
                 found=f"{size} bytes",
                 advice="the file may be truncated, of another grid, or of another type",
             )
@@ -345,33 +306,41 @@ class LabelFolder(GridFrames):
         """
         if seen_by == "camera":
             return None
-        if (counts := self._counts(frame)) is not None:
+        file = self.file_of(frame)
+        if (counts := _counts_of(file)) is not None:
             return np.fromfile(counts, "<f4") > 0
-        if (invalid := self._file(frame, ".invalid")).is_file():
-            mask = np.fromfile(invalid, np.uint8)
-            if self.voxels is not None and mask.size not in (
-                self.voxels,
-                -(-self.voxels // _BITS),
-            ):
+        if not (invalid := file.with_suffix(".invalid")).is_file():
+            return None
+        mask = np.fromfile(invalid, np.uint8)
+        if self.voxels is not None and mask.size != self.voxels:
+            packed = -(-self.voxels // _BITS)
+            if mask.size != packed:
                 raise FormatError(
                     invalid,
-                    expected=f"{self.voxels} bytes, or {-(-self.voxels // _BITS)} of packed bits",
+                    expected=f"{self.voxels} bytes, or {packed} of packed bits",
                     found=str(mask.size),
                     advice="the file may be truncated, or of another grid",
                 )
-            if mask.size != self.voxels:
-                mask = np.unpackbits(mask, count=self.voxels)
-            return mask == 0
+            mask = np.unpackbits(mask, count=self.voxels)
+        return mask == 0
+
+
+_PLAIN = VoxelFormat("labels", {}, None, None, label_bytes=4, named="assumed", origin=None)
+
+
+def label_frames(folder: Path, path: str = "") -> LabelFrames | None:
+    """Return the frames of the `.label` files of a folder, whatever its name; None without any."""
+    names = [name for name in os.listdir(folder) if layout.frame_of(name, ".label") is not None]
+    files = {name.removesuffix(".label"): folder / name for name in names}
+    return LabelFrames(_PLAIN, folder, path, files) if files else None
+
+
+def _counts_of(labels: Path) -> Path | None:
+    """Return the file of a frame's counts, with four bytes per voxel; None without."""
+    counts = labels.with_suffix(".bin")
+    if not counts.is_file() or labels.with_suffix(".invalid").is_file():
         return None
-
-    def poses(self) -> FloatArray | None:
-        """Return (F, 4, 4) poses of the grid; None if the folders hold none."""
-        if self.format is None or self.format.poses is None:
-            return None
-        return self.format.poses(self.folder.parent, [f"{n:06d}" for n in self.frames().tolist()])
-
-    def _file(self, frame: int, suffix: str) -> Path:
-        return self.folder / f"{frame:06d}{suffix}"
+    return counts if counts.stat().st_size >= labels.stat().st_size else None
 
 
 class VoxelSequence(Sequence):
@@ -389,12 +358,25 @@ class VoxelSequence(Sequence):
         self.path, self.location, self.frames_of = path, first.location, frames_of
         self.name = path.rpartition("/")[2] or Path(first.location).name
 
+    @property
+    def is_at_sensor(self) -> bool:
+        """Whether the grids have the frame of the layout: the sensor's, x forward."""
+        grid = next(iter(self.frames_of.values()))
+        turned = isinstance(grid, VoxelFrames) and grid.format.y_forward
+        return grid.origin == (0.0, 0.0, 0.0) and not turned
+
     def with_classes(self, classes: ClassTable) -> VoxelSequence:
         """Return the same files, read with another class table."""
         frames_of = {name: copy.copy(frames) for name, frames in self.frames_of.items()}
         for frames in frames_of.values():
-            frames.classes, frames.named = classes, "option"
+            frames.classes, frames.named = classes, "option"  # with the ids of the files
         return VoxelSequence(self.path, frames_of)
+
+    def follow(self, grid: str, truth: Sequence, truth_grid: str) -> None:
+        """Take the numbers of frames, which are named by tokens, from the ground truth."""
+        if isinstance(truth, VoxelSequence):
+            self.frames_of[grid].follow(truth.frames_of[truth_grid])
+            vars(self).pop("_fields", None)
 
     @cached_property
     def metadata(self) -> Metadata:
@@ -449,14 +431,23 @@ class VoxelSequence(Sequence):
             found, expected = str(labels.size), f"{spec.num_voxels} voxels ({spec})"
             raise FormatError(where, expected=expected, found=found)
         labels, table = labels.reshape(spec.size), grid.classes or CARLASC11
-        counted = labels != IGNORED_ID
+        counted = is_counted(labels, table)
         if part == "counts":
             known = grid.known(frame)
             counted &= True if known is None else known.reshape(spec.size)
             return counted.astype(np.float32)
         labels = np.where(counted, labels, table.free)
         if unknown := table.unknown(labels):
-            raise FormatError(where, expected=f"class ids of {table.name}", found=times(unknown))
+            names = [one.name for one in tables_with(np.unique(labels).tolist(), table)]
+            best = grid.benchmark if grid.benchmark in names else next(iter(names), None)
+            raise FormatError(
+                where,
+                expected=f"class ids of {table.name}",
+                found=times(unknown),
+                advice=f"if they are ids of {best}, give `source_classes={best}`"
+                if best
+                else "correct the labels, or name their table with `source_classes`",
+            )
         swap = np.arange(max(table.names) + 1, dtype=table.dtype)
         swap[[0, table.free]] = table.free, 0
         return swap[labels]
@@ -493,10 +484,11 @@ class VoxelSequence(Sequence):
         if grid.spec is not None:
             return grid.spec
         expected, found = "a grid of known geometry", "files of another size"
-        if isinstance(grid, LabelFolder) and grid.format is not None:
-            usual = grid.format.spec
+        if isinstance(grid, LabelFrames) and (usual := grid.format.spec) is not None:
             expected = f"{usual.num_voxels} voxels per frame, {usual}, as {grid.format.name} has"
-            found = f"{grid.voxels}" + _same_area(grid.voxels or 0, usual)
+            found, (x, y, _) = str(grid.voxels), usual.size
+            if grid.voxels and grid.voxels % (x * y) == 0:
+                found += f", as {x} x {y} x {grid.voxels // (x * y)} has"
         raise FormatError(
             grid.location,
             expected=expected,
@@ -505,30 +497,7 @@ class VoxelSequence(Sequence):
         )
 
 
-def _same_area(voxels: int, spec: GridSpec) -> str:
-    """Return the size of a grid with as many columns as `spec`, in words, if `voxels` fit one."""
-    x, y, _ = spec.size
-    return f", as {x} x {y} x {voxels // (x * y)} has" if voxels and voxels % (x * y) == 0 else ""
-
-
-class VoxelSource(Source):
-    """Voxel grids in the files of other programs, presented in the layout."""
-
-    def __init__(self, place: Path, sequences: Mapping[str, Mapping[str, GridFrames]]) -> None:
-        self.location, self._sequences = str(place), sequences
-
-    def sequences(self) -> Mapping[str, Sequence]:
-        """Return the sequences by path."""
-        return {
-            path: VoxelSequence(path, self._sequences[path]) for path in sorted(self._sequences)
-        }
-
-    def frames_of(self) -> Mapping[str, Mapping[str, GridFrames]]:
-        """Return the frames of each grid of each sequence, with the ids of the files."""
-        return self._sequences
-
-
-def find_voxels(place: Path) -> VoxelSource | None:
+def find_voxels(place: Path) -> ChosenSequences | None:
     """Return the voxel grids of other programs at a place; None if there are none.
 
     Formats are tried in the order of their names; the first one that is found is taken.
@@ -542,7 +511,8 @@ def find_voxels(place: Path) -> VoxelSource | None:
         for grid, frames in format.find(place):
             sequences.setdefault(frames.path, {}).setdefault(grid, frames)
         if sequences:
-            return VoxelSource(place, sequences)
+            found = {path: VoxelSequence(path, sequences[path]) for path in sorted(sequences)}
+            return ChosenSequences(str(place), found)
     return None
 
 
@@ -557,40 +527,32 @@ def matches(place: Path, template: str) -> Iterator[tuple[Path, dict[str, str]]]
 
     `place` is above the first part of the template, or is one of its parts.
     """
-    parts = [_part(part) for part in template.split("/")]
+    glob, expression = _patterns(template)
+    parts = glob.split("/")
     for number in range(len(parts) + 1):
-        own = place.parts[len(place.parts) - number :]
-        given = [_names(part, name) for part, name in zip(parts, own, strict=False)]
-        if None in given:
+        above, below = "/".join(parts[:number]), "/".join(parts[number:])
+        if above and not place.match(above):
             continue
-        below = parts[number:]
-        found = [place] if not below and place.is_file() else []
-        if below and place.is_dir():
-            found = sorted(place.glob("/".join(glob for glob, _ in below)))
-        for path in found:
-            own_names = path.parts[len(path.parts) - len(below) :]
-            rest = [_names(part, name) for part, name in zip(below, own_names, strict=True)]
-            yield (
-                path,
-                {key: name for each in (*given, *rest) for key, name in (each or {}).items()},
-            )
-        if found:
+        paths = [place] if place.is_file() and not below else []
+        if place.is_dir() and below:
+            paths = sorted(place.glob(below))
+        for path in paths:
+            if found := expression.fullmatch("/".join(path.parts[-len(parts) :])):
+                yield path, found.groupdict()
+        if paths:
             return
 
 
-def _names(part: tuple[str, re.Pattern[str]], name: str) -> dict[str, str] | None:
-    """Return the named pieces of one part of a path; None if the part does not fit."""
-    glob, pattern = part
-    match = pattern.fullmatch(name) if fnmatch.fnmatchcase(name, glob) else None
-    return None if match is None else match.groupdict()
-
-
 @cache
-def _part(part: str) -> tuple[str, re.Pattern[str]]:
-    """Return the glob pattern of a part of a template, and an expression of its named pieces."""
-    pieces, expression = re.split(r"(\{\w+(?:=[^}]*)?\})", part), ""
-    for piece in pieces:
-        name = re.match(r"\{(\w+)", piece)
-        expression += f"(?P<{name[1]}>.+)" if name else re.escape(piece).replace(r"\*", ".*")
-    glob = re.sub(r"\{\w+(?:=([^}]*))?\}", lambda found: found[1] or "*", part)
+def _patterns(template: str) -> tuple[str, re.Pattern[str]]:
+    """Return the glob pattern of a template, and an expression of its named parts."""
+    first, *rest = re.split(r"\{(\w+)(?:=([^}]*))?\}", template)
+    glob, expression = first, _escaped(first)
+    for name, pattern, text in zip(rest[::3], rest[1::3], rest[2::3], strict=True):
+        glob += (pattern or "*") + text
+        expression += f"(?P<{name}>[^/]+)" + _escaped(text)
     return glob, re.compile(expression)
+
+
+def _escaped(text: str) -> str:
+    return re.escape(text).replace(r"\*", "[^/]*")

@@ -5,8 +5,11 @@ Tests of converters write it in the format of another data set and compare.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from importlib.resources import files
+from typing import Any
 
 import numpy as np
 
@@ -54,26 +57,14 @@ class Thing:
         return poses
 
 
+def read_things(rows: Sequence[Sequence[Any]]) -> tuple[Thing, ...]:
+    """Return things from rows of kind, center, size, heading and speed; the last two may lack."""
+    return tuple(Thing(kind, tuple(row[:3]), tuple(row[3:6]), *row[6:]) for kind, *row in rows)
+
+
 def _street() -> tuple[Thing, ...]:
-    houses = [
-        Thing("building", (x, side * 14.0, 4.0), (9.0, 6.0, 8.0))
-        for x in range(-20, 80, 14)
-        for side in (-1, 1)
-    ]
-    poles = [Thing("pole", (x + 0.5, 7.5, 2.5), (0.2, 0.2, 5.0)) for x in range(-24, 80, 16)]
-    trees = [
-        Thing("vegetation", (x + 3.0, -8.5, 2.0), (1.6, 1.6, 4.0), 0.4) for x in range(-20, 80, 11)
-    ]
-    return (
-        *houses,
-        *poles,
-        *trees,
-        Thing("car", (12.0, 1.0, 0.8), (4.4, 1.8, 1.5), 0.0, 8.0),
-        Thing("car", (40.0, 4.5, 0.8), (4.2, 1.8, 1.5), np.pi, 7.0),
-        Thing("van", (9.0, -4.0, 1.0), (5.0, 2.0, 1.9), 0.05),
-        Thing("pedestrian", (7.0, 5.5, 0.9), (0.6, 0.6, 1.75), 0.3, 1.4),
-        Thing("cyclist", (3.0, -2.2, 0.9), (1.8, 0.6, 1.75), 0.0, 4.5),
-    )
+    """Return a street with houses, poles, trees and traffic."""
+    return read_things(json.loads(files(__package__).joinpath("street.json").read_text("utf-8")))
 
 
 @dataclass(frozen=True)

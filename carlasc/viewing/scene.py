@@ -121,6 +121,8 @@ class Scene:
         reference = None
         if truth is not None:
             reference = RemappedSequence(truth.sequence, choose_grid(truth, self.truth_grid))
+            if isinstance(part.sequence, VoxelSequence) and grid:
+                part.sequence.follow(grid, truth.sequence, reference.grid)
             if "errors" in contents:
                 check_same_geometry(data.spec, reference.spec)
         table = common_table(data, reference, table_of(self.classes))
@@ -572,6 +574,12 @@ class SceneReader:
     def table(self) -> ClassTable:
         """The class table of all grids and points."""
         return self.data.shown or self.data.stored_table
+
+    @property
+    def shows_ego(self) -> bool:
+        """Whether a plain car can be drawn at the sensor: not in grids with another frame."""
+        sequence = self.data.sequence
+        return not isinstance(sequence, VoxelSequence) or sequence.is_at_sensor
 
     @property
     def table_use(self) -> TableUse:

@@ -142,7 +142,7 @@ class Window:
 
     def _draw(self) -> None:
         content = self.reader.read(self.reader.frames[self.position])
-        parts, shapes = [ego_vehicle()], []
+        parts, shapes = [ego_vehicle()] if self.reader.shows_ego else [], []
         if self.look < len(content.grids):
             grid, colors = content.grids[self.look], self.reader.panels[self.look].colors
             parts.append(grid_mesh(grid.spec, colors.by_id[grid.labels], grid.labels > 0))

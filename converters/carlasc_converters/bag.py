@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from carlasc.converting.protocol import Converter, FrameHandle, Recording, Senso
 from carlasc.core import CameraModel
 from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.tables import CARLA
-from carlasc.errors import CarlascError, FormatError, MissingDataError
+from carlasc.errors import CarlascError, FormatError, MissingDataError, first_names
 from carlasc_converters.bag_messages import CAMERA_INFO, PATH, TRANSFORMS, read_placed
 from carlasc_converters.bag_topics import (
     BagCamera,
@@ -31,7 +31,8 @@ from carlasc_converters.point_fields import TimeUnit
 from carlasc_converters.transforms import BAD_SHARE, FrameTrack, FrameTree, PlacedFrame, are_poses
 
 _BASES = ("base_link", "base_footprint")  # names of the frame of a vehicle, by ROS' REP 105
-_MOVED = 0.2  # metres, or sine of an angle, by which a LiDAR may move on the vehicle
+_MOVED = 0.02  # metres, or sine of an angle: a LiDAR that moves less on the vehicle is fixed
+_AROUND_NS = 10**9  # a frame needs the motion of a LiDAR on the vehicle around it
 _WORLDS = ("odom", "map", "world")  # names of frames that do not move, the smoothest first
 
 
@@ -128,7 +129,9 @@ class BagRecording(Recording):
                 *((k, rows[number], others[k - 1].clock) for k, rows in enumerate(near, 1)),
             ]
             given = tuple(
-                CloudPlace(k, message, clock) for k, message, clock in parts if message is not None
+                CloudPlace(k, message, clock, self._mount(k, stamp))
+                for k, message, clock in parts
+                if message is not None
             )
             frames.append(BagFrame(number, f"{place}: message {number}", stamp, given))
         return frames
@@ -139,17 +142,49 @@ class BagRecording(Recording):
 
         Raises:
             MissingDataError: there are several, and no transforms between them.
-            FormatError: one moves on the vehicle, or its points are in the frame of the world.
+            FormatError: the points of one are in the frame of the world.
         """
         tree, sensors = self._tree, list[Sensor]()
-        for lidar in self._lidars:
+        for lidar, motion in zip(self._lidars, self._motions, strict=True):
             if not tree.connected(lidar.frame, self._vehicle):
                 raise self._no_path(lidar.frame, self._vehicle, "convert one LiDAR with `topics`")
-            place, last = tree.lookup(self._vehicle, lidar.frame, lidar.stamps[[0, -1]])
-            if np.abs(last - place).max() > _MOVED:
-                raise self._in_world(lidar.frame)
-            sensors.append(Sensor(lidar.name, place, deskewed=self._options.deskewed))
+            (place,) = tree.lookup(self._vehicle, lidar.frame, lidar.stamps[:1])
+            points_in: Literal["sensor", "vehicle"] = "sensor" if motion is None else "vehicle"
+            sensors.append(Sensor(lidar.name, place, points_in, deskewed=self._options.deskewed))
         return sensors
+
+    @cached_property
+    def _motions(self) -> list[tuple[IntArray, FloatArray] | None]:
+        """The times and poses of each LiDAR on the vehicle; None if it does not move there.
+
+        Raises:
+            FormatError: its frame does not belong to the vehicle.
+        """
+        tree, motions = self._tree, list[tuple[IntArray, FloatArray] | None]()
+        for frame in (lidar.frame for lidar in self._lidars):
+            known = tree.connected(frame, self._vehicle)
+            stamps = tree.motion(self._vehicle, frame) if known else None
+            poses = None if stamps is None else tree.lookup(self._vehicle, frame, stamps)
+            if stamps is None or poses is None or np.ptp(poses, axis=0).max() <= _MOVED:
+                motions.append(None)
+                continue
+            if frame in tree.ancestors(self._vehicle):
+                raise self._in_world(frame)
+            self._notes.append(
+                f"{self.location}: {frame} moves on {self._vehicle}, as transforms say"
+            )
+            motions.append((stamps, poses))
+        return motions
+
+    def _mount(self, lidar: int, stamp: int) -> Trajectory | None:
+        """Return the poses of a LiDAR on the vehicle around a frame; None if it does not move."""
+        motion = self._motions[lidar]
+        if motion is None:
+            return None
+        first, last = np.searchsorted(motion[0], [stamp - _AROUND_NS, stamp + _AROUND_NS])
+        near = slice(max(int(first) - 1, 0), int(last) + 1)
+        seconds = np.asarray((motion[0][near] - stamp) * 1e-9, np.float64)
+        return Trajectory(motion[1][near], seconds, self.location)
 
     def times(self) -> FloatArray:
         """Return seconds after the first frame."""
@@ -272,6 +307,13 @@ class BagRecording(Recording):
             )
         if left:
             notes.append(f"{self.location}: not read: {', '.join(left)}")
+        for camera in self._cameras.values():  # their transforms are used, too
+            if self._tree.connected(camera.frame, self._vehicle):
+                self._tree.motion(self._vehicle, camera.frame)
+        if self._tree.unused:
+            notes.append(
+                f"{self.location}: transforms that were not used: {first_names(self._tree.unused)}"
+            )
         return list(dict.fromkeys(notes))
 
     @cached_property

@@ -20,12 +20,13 @@ from typing import Any
 
 import numpy as np
 
-from carlasc.converting.protocol import Cloud, FrameHandle
+from carlasc.converting.protocol import Cloud, FrameHandle, Trajectory
 from carlasc.core import CameraModel
 from carlasc.core.arrays import FloatArray, IntArray, RecordArray
 from carlasc.core.cameras import Lens
 from carlasc.core.geometry import Transform, transform_points
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, reading
+from carlasc.motion.odometry import move_each, ticks_of
 from carlasc.storage.camera_files import encode_image
 from carlasc_converters import db3_file, mcap_file, ros1_bag
 from carlasc_converters.bag_messages import (
@@ -473,11 +474,13 @@ class CloudPlace:
         sensor: index of the LiDAR.
         place: its message.
         clock: how the times of points are found; None if they have none.
+        mount: poses of the LiDAR on the vehicle, by seconds after the frame; None if it is fixed.
     """
 
     sensor: int
     place: MessagePlace
     clock: PointClock | None
+    mount: Trajectory | None = None
 
 
 @dataclass(frozen=True)
@@ -523,7 +526,15 @@ class BagFrame(FrameHandle):
             seconds = seconds[seen] + late
         elif late:
             seconds = np.full(len(points), late)
-        return Cloud(points, seconds=seconds, sensor=cloud.sensor)
+        if cloud.mount is None:
+            return Cloud(points, seconds=seconds, sensor=cloud.sensor)
+        ticks, tick_of = ticks_of(np.full(len(points), late) if seconds is None else seconds)
+        known = cloud.mount.seconds
+        assert known is not None
+        vehicle_T_then = cloud.mount.at(ticks.clip(known[0], known[-1]))
+        points[:, :3] = move_each(points, vehicle_T_then, tick_of)
+        origins = vehicle_T_then[tick_of, :3, 3].astype(np.float32)
+        return Cloud(points, seconds=seconds, origins=origins, sensor=cloud.sensor)
 
 
 _MODELS: dict[str, tuple[Lens, tuple[int, ...]]] = {

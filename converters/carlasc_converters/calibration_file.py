@@ -1,4 +1,4 @@
-"""The poses of the LiDARs on a vehicle, from a YAML or JSON file."""
+"""The poses of the LiDARs on a vehicle, from a YAML or JSON file, and the axes of data."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from carlasc.core.arrays import FloatArray
-from carlasc.core.geometry import Transform, check_rigid
-from carlasc.errors import FormatError, import_extra
+from carlasc.core.geometry import DIRECTIONS, Transform, check_rigid
+from carlasc.errors import ArgumentError, FormatError, import_extra
 from carlasc_converters.files import opening, read_text
 from carlasc_converters.transforms import poses_of
 
@@ -51,6 +51,34 @@ def _pose(entry: Mapping[str, Any], where: str) -> Transform:
     place = np.asarray(entry["translation"], np.float64).reshape(1, 3)
     pose: Transform = poses_of(np.array([[w, x, y, z]]), place, where)[0]
     return pose
+
+
+def axes_named(name: str) -> Transform:
+    """Return (4, 4) from axes that are named by their directions to x forward, y to the left, z up.
+
+    Args:
+        name: a letter for x, y and z each: f(orward), b(ackward), l(eft), r(ight), u(p), d(own).
+            "flu" are those of ROS, "fru" the left-handed ones of CARLA and Unreal, "rfu" have y
+            forward, "rdf" are a camera's.
+
+    Raises:
+        ArgumentError: the letters are not three directions at right angles.
+    """
+    columns = np.array([DIRECTIONS.get(letter, (0, 0, 0)) for letter in name.lower()], np.float64).T
+    if (
+        columns.shape != (3, 3)
+        or not np.array_equal(np.abs(columns).sum(axis=0), [1, 1, 1])
+        or np.linalg.matrix_rank(columns) < 3
+    ):
+        raise ArgumentError(
+            "source_axes",
+            expected="directions of x, y and z, such as flu (forward, left, up), fru, rfu, frd or "
+            "rdf",
+            found=repr(name),
+        )
+    transform = np.eye(4)
+    transform[:3, :3] = columns
+    return transform
 
 
 def in_axes(transform: Transform, poses: FloatArray) -> FloatArray:

@@ -43,6 +43,11 @@ def unpack_bits(data: bytes, size: tuple[int, int, int], where: str) -> BoolArra
     return np.unpackbits(np.frombuffer(data, np.uint8), count=voxels).reshape(size).astype(np.bool_)
 
 
+def _height_of(voxels: int) -> str:
+    """Return the size of a grid with the columns of the benchmark in words; "" for another one."""
+    return "" if voxels % (256 * 256) else f" (256 x 256 x {voxels // (256 * 256)} uint16)"
+
+
 def read_voxel_files(folder: Path, frame: int) -> VoxelContent | None:
     """Read a frame's voxel files; None if the frame has no labels.
 
@@ -64,8 +69,8 @@ def read_voxel_files(folder: Path, frame: int) -> VoxelContent | None:
         raise FormatError(
             folder / f"{frame:06d}.label",
             expected=f"{2 * voxels} bytes (256 x 256 x 32 uint16)",
-            found=str(len(data)),
-            advice=_COPY,
+            found=str(len(data)) + _height_of(len(data) // 2),
+            advice=_COPY if len(data) % (2 * 256 * 256) else "export a grid of that size",
         )
     labels = np.frombuffer(data, "<u2").reshape(GRID.size)
     known = np.ones(GRID.size, np.bool_)

@@ -18,6 +18,7 @@ from carlasc.core.arrays import (
     Uint8Array,
     Uint32Array,
 )
+from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.errors import FormatError
 
 # Types of sensor_msgs/PointField:
@@ -245,7 +246,10 @@ def _time_columns(columns: Columns) -> list[PointClock]:
 
 
 def named_fields(
-    columns: Columns, where: str, clock: PointClock | None = None
+    columns: Columns,
+    where: str,
+    clock: PointClock | None = None,
+    world_T_scan: Transform | None = None,
 ) -> dict[str, AnyArray]:
     """Return the fields of some points by one name each.
 
@@ -253,6 +257,8 @@ def named_fields(
         columns: the points.
         where: the file or the message, for errors.
         clock: the times of points.
+        world_T_scan: (4, 4) the pose of the scan, if its points are in the world frame, whose large
+            numbers are no float32 numbers.
 
     Returns:
         `points` (N, 4) float32, x, y, z and the intensity (0 without one); if they exist, `time`
@@ -274,6 +280,9 @@ def named_fields(
     for axis, field in enumerate(("x", "y", "z", "intensity")):
         if given[field] is not None:
             points[:, axis] = given[field]
+    if world_T_scan is not None:
+        places = np.column_stack([given[axis] for axis in "xyz"])  # type: ignore[misc]
+        points[:, :3] = transform_points(invert(world_T_scan), places)
     fields: dict[str, AnyArray] = {"points": points}
     if clock is not None and (times := clock.of(columns)) is not None:
         fields["time"] = times

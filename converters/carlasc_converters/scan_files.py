@@ -13,7 +13,7 @@ import numpy as np
 
 from carlasc.converting import Cloud, FrameHandle
 from carlasc.core.arrays import Uint32Array
-from carlasc.core.geometry import Transform, invert, transform_points
+from carlasc.core.geometry import Transform
 from carlasc.errors import FormatError
 from carlasc.relabelling.predictions import load
 from carlasc.storage.arrays import NUMBERS, ArrayFormat, read_npy
@@ -26,6 +26,8 @@ from carlasc_converters.point_fields import (
     whole_numbers,
 )
 from carlasc_converters.point_files import read_columns
+
+_NOT_ALL = {"label", "instance"}  # fields that some of the scans may lack
 
 
 @dataclass(frozen=True)
@@ -82,8 +84,8 @@ class ScanFile(FrameHandle):
 
     def _read(self, index: int, path: str) -> Cloud:
         columns = read_columns(Path(path), self.options.columns)
-        fields = named_fields(columns, path, self.clock)
-        if set(fields) != set(self.fields):
+        fields = named_fields(columns, path, self.clock, self.world_T_scan)
+        if set(fields) - _NOT_ALL != set(self.fields) - _NOT_ALL:
             raise FormatError(
                 path,
                 expected=f"the fields of the first scan ({', '.join(self.fields)})",
@@ -92,10 +94,15 @@ class ScanFile(FrameHandle):
         points, seconds = fields["points"], None
         if self.clock is not None:
             seconds = self.clock.seconds(columns, returns(columns), self.stamp, path)
-        labels = fields.get("label") if self.options.has_classes else None
+        labels, instances = fields.get("label"), fields.get("instance")
         if self.labels is not None and index == 0:
             labels = read_labels(Path(self.labels), len(points))
-        instances = fields.get("instance") if self.options.has_classes else None
+        if not self.options.has_classes:
+            labels = instances = None
+        elif labels is None and (self.options.label_dir or "label" in self.fields):
+            labels = np.zeros(len(points), np.uint32)  # other scans have labels
+        if labels is not None and instances is None and "instance" in self.fields:
+            instances = np.zeros(len(points), np.uint32)
         finite = np.isfinite(points[:, :3]).all(axis=1)
         if not finite.any():
             raise FormatError(
@@ -103,8 +110,6 @@ class ScanFile(FrameHandle):
             )
         points = points[finite]
         points[:, 3] = np.nan_to_num(points[:, 3])
-        if self.world_T_scan is not None:
-            points[:, :3] = transform_points(invert(self.world_T_scan), points[:, :3])
         if not np.array_equal(self.options.axes, np.eye(4)):
             points = points.copy()
             points[:, :3] = points[:, :3] @ self.options.axes[:3, :3].T.astype(np.float32)

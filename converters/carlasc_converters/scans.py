@@ -15,11 +15,11 @@ import numpy as np
 
 from carlasc.converting import Converter, FrameHandle, Recording, Sensor, Trajectory
 from carlasc.core.arrays import AnyArray, FloatArray, IntArray
-from carlasc.core.geometry import Transform, axes_named, invert, slerp
+from carlasc.core.geometry import Transform, invert, slerp
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.motion.ground import find_ground
-from carlasc_converters.calibration_file import in_axes, read_calibration
+from carlasc_converters.calibration_file import axes_named, in_axes, read_calibration
 from carlasc_converters.files import raw_advice, sequence_name
 from carlasc_converters.given_classes import classes_given
 from carlasc_converters.pcd import PcdHeader, read_header
@@ -48,9 +48,10 @@ _LABELS = (".label", ".npy", ".txt")
 _GRAPH_SLAM = "cloud.pcd"  # hdl_graph_slam: a folder for each scan, with the file `data`
 _GROUND_M = 0.3  # ground must be at least this far below the sensor
 _NEARER = 1.05  # points that are farther from the viewpoint than from the origin by this are not
-_TILTED, _LEVEL = 0.5, 0.9  # cosine of the tilt of poses that are wrong, and that are right
+# cosine of the tilt of poses that are right, and its difference to that of poses that are wrong
+_LEVEL, _CLEARLY = 0.9, 0.1
 _SLACK = 10  # numbers of scans before the first pose or after the last one that get a pose
-_SLACK_NS = 10**9  # scans up to this time before the first pose or after the last one get a pose
+_SLACK_NS = 10**9  # clocks of scans and poses that differ by more are others
 
 
 class Scans(Converter):
@@ -303,10 +304,10 @@ class ScanFolder(Recording):
         if rows.other is None or up is None:
             return rows
         level, other = (up * poses[:, 2, 2].mean() for poses in (rows.world_T_body, rows.other))
-        if level > _TILTED or other < _LEVEL:
-            return rows
+        if other < max(_LEVEL, level + _CLEARLY):
+            return rows  # if the scans do not overlap, the other order is tried
         said = f"{file}: quaternions are w, x, y, z, because otherwise the ground is not below"
-        return replace(rows, world_T_body=rows.other, notes=(*rows.notes, said))
+        return replace(rows, world_T_body=rows.other, other=None, notes=(*rows.notes, said))
 
     @cached_property
     def _up(self) -> int | None:
@@ -374,7 +375,7 @@ class ScanFolder(Recording):
             ScanFile(
                 number,
                 tuple(str(files[number]) for files in self._files.values()),
-                None if labels is None else str(labels[number]),
+                None if labels is None or labels[number] is None else str(labels[number]),
                 tuple(self._first),
                 self._options,
                 self._clock,
@@ -387,8 +388,8 @@ class ScanFolder(Recording):
         ]
 
     @cached_property
-    def _labels(self) -> list[Path] | None:
-        """The file of labels of each scan of the first LiDAR."""
+    def _labels(self) -> list[Path | None] | None:
+        """The file of labels of each scan of the first LiDAR, None for those without one."""
         folder = self._options.label_dir
         if folder is None:
             return None
@@ -397,14 +398,14 @@ class ScanFolder(Recording):
             if folder.is_dir()
             else {}
         )
-        if missing := [path.stem for path in self._paths if path.stem not in labels]:
+        found = [labels.get(path.stem) for path in self._paths]
+        if not any(found):
             raise MissingDataError(
                 folder,
                 expected=f"a file {', '.join(_LABELS)} for each scan",
-                found=f"none for {missing[0]}"
-                + (f" and {len(missing) - 1} more" if len(missing) > 1 else ""),
+                found="none for any scan",
             )
-        return [labels[path.stem] for path in self._paths]
+        return found
 
     @cached_property
     def sensors(self) -> Sequence[Sensor]:  # type: ignore[override]
@@ -448,11 +449,13 @@ class ScanFolder(Recording):
                 found="none",
                 advice='give it, or `pose_of="sensor"` if they are those of the sensor',
             )
-        world_T_body = in_axes(self._options.axes, rows.world_T_body)
         vehicle_T_sensor = self.sensors[0].vehicle_T_sensor
-        world_T_vehicle = (
-            world_T_body if of == "vehicle" else world_T_body @ invert(vehicle_T_sensor)
+        body_T_vehicle = np.eye(4) if of == "vehicle" else invert(vehicle_T_sensor)
+        world_T_vehicle, other = (
+            None if poses is None else in_axes(self._options.axes, poses) @ body_T_vehicle
+            for poses in (rows.world_T_body, rows.other)
         )
+        assert world_T_vehicle is not None
         stamps, where = self._stamps[0], str(self._options.pose_file or self.location)
         if rows.numbers is not None:
             return Trajectory(self._by_number(rows.numbers, world_T_vehicle), where=where)
@@ -465,15 +468,15 @@ class ScanFolder(Recording):
                     advice="give `time_file`, and poses with times: without times, poses are "
                     "matched by their order",
                 )
-            return Trajectory(world_T_vehicle, where=where)
-        if stamps[0] < rows.stamps[0] - _SLACK_NS or stamps[-1] > rows.stamps[-1] + _SLACK_NS:
+            return Trajectory(world_T_vehicle, where=where, other=other)
+        if not _together(stamps, rows.stamps):
             raise FormatError(
                 where,
                 expected=f"poses over the time of the scans, {_span(stamps)}",
                 found=f"poses over {_span(rows.stamps)}",
                 advice="check that both use the same clock",
             )
-        return Trajectory(world_T_vehicle, (rows.stamps - stamps[0]) / 1e9, where)
+        return Trajectory(world_T_vehicle, (rows.stamps - stamps[0]) / 1e9, where, other)
 
     def _by_number(self, numbers: IntArray, poses: FloatArray) -> FloatArray:
         """Return the poses of the scans, interpolated by the numbers in the names of their files.
@@ -526,6 +529,11 @@ class ScanFolder(Recording):
             notes.append(
                 f"the times of points are in {self._clock.unit}, because scans then have a usual "
                 f"duration"
+            )
+        if missing := (self._labels or []).count(None):
+            notes.append(
+                f"{missing} of {len(self._paths)} scans have no file of labels: their points are "
+                f"unlabelled"
             )
         if not self.sensors[0].deskewed:
             notes.append(

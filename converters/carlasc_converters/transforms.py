@@ -121,6 +121,7 @@ class FrameTree:
 
     def __init__(self, where: str) -> None:
         self._where = where
+        self._used = set[tuple[str, str]]()
         self._tracks: dict[str, dict[str, FrameTrack]] = defaultdict(dict)
 
     def add(self, placed: PlacedFrame) -> None:
@@ -149,6 +150,7 @@ class FrameTree:
         """Return the tracks from a frame up to one of its ancestors."""
         line = self.ancestors(frame)
         line = line[: line.index(ancestor) + 1]
+        self._used |= {(parent, child) for child, parent in pairwise(line)}
         return [self._tracks[child][parent] for child, parent in pairwise(line)]
 
     @property
@@ -159,6 +161,20 @@ class FrameTree:
     def connected(self, one: str, other: str) -> bool:
         """Return whether there is a path between two frames."""
         return self.ancestors(one)[-1] == self.ancestors(other)[-1]
+
+    def motion(self, target: str, source: str) -> IntArray | None:
+        """Return the (K,) nanoseconds at which the motion of one of two connected frames in the
+        other is known; None if it does not move there.
+        """
+        above = self.ancestors(target)
+        common = next(frame for frame in self.ancestors(source) if frame in above)
+        tracks = self.edges(source, common) + self.edges(target, common)
+        return max((track.values[0] for track in tracks if track.moves), key=len, default=None)
+
+    @property
+    def unused(self) -> list[str]:
+        """The transforms that were not used, each as parent > child."""
+        return [name for pair, name in self._named.items() if pair not in self._used]
 
     def lookup(self, target: str, source: str, stamps: IntArray) -> FloatArray:
         """Return (M, 4, 4) target_T_source at some times, of two frames that are connected."""
@@ -179,7 +195,12 @@ class FrameTree:
 
     def __str__(self) -> str:
         """Name the frames, each with its parent."""
-        named = [
-            f"{parent} > {child}" for child, parents in self._tracks.items() for parent in parents
-        ]
-        return ", ".join(sorted(named)) or "no frames"
+        return ", ".join(sorted(self._named.values())) or "no frames"
+
+    @property
+    def _named(self) -> dict[tuple[str, str], str]:
+        return {
+            (parent, child): f"{parent} > {child}"
+            for child, parents in self._tracks.items()
+            for parent in parents
+        }

@@ -33,7 +33,7 @@ from carlasc.storage.files import parse_json
 from carlasc.storage.voxel_files import (
     IGNORED_ID,
     GridFrames,
-    LabelFolder,
+    LabelFrames,
     SeenBy,
     VoxelFormat,
     matches,
@@ -159,8 +159,8 @@ class _Columns:
 
 
 def kitti_poses(folder: Path, names: list[str]) -> FloatArray | None:
-    """Return (F, 4, 4) poses of the LiDAR from the poses.txt and calib.txt of a sequence."""
-    poses, calibration = folder / "poses.txt", folder / "calib.txt"
+    """Return (F, 4, 4) poses of the LiDAR from the poses.txt and calib.txt above the voxels."""
+    poses, calibration = folder.parent / "poses.txt", folder.parent / "calib.txt"
     if not (poses.is_file() and calibration.is_file()):
         return None
     with reading(poses, "a pose of 12 numbers for each scan, and Tr in calib.txt"):
@@ -200,15 +200,16 @@ class CarlaScPredictions(VoxelFormat):
         """Yield the folders of predictions at a place, each with its name."""
         for above in ("", "*/", "*/*/"):
             template = f"{above}{{coordinates=c[ay]*}}/{{grid}}/{{frame={_SIX}}}.label"
-            for folder in sorted({path.parent for path, _ in matches(place, template)}):
+            found: dict[Path, dict[str, Path]] = {}
+            for path, names in matches(place, template):
+                found.setdefault(path.parent, {})[names["frame"]] = path
+            for folder, files in sorted(found.items()):
                 coordinates, scans = folder.parent.name, layout.scan_folders()
                 if coordinates not in layout.COORDINATES or folder.name in scans:
                     continue
-                names = frozenset({place.stem}) if place.is_file() else None
                 for preset in ("coarse", "fine", "cylindrical"):
                     format = replace(self, spec=GridSpec.published(preset))
-                    path = "/".join(folder.parts[-4:-1])
-                    frames = LabelFolder(folder, path, format, names)
+                    frames = LabelFrames(format, folder, "/".join(folder.parts[-4:-1]), files)
                     if frames.spec is not None and frames.spec.coordinates == coordinates:
                         yield folder.name, frames
                         break
@@ -222,7 +223,6 @@ CARLASC = CarlaScPredictions(
     label_bytes=4,
     named="assumed",
     benchmark=("carlasc",),
-    place="the sensor, x forward",
 )
 _KITTI = VoxelFormat(
     "SemanticKITTI",
@@ -249,7 +249,10 @@ SSCBENCH_FILES = replace(
 PREPROCESSED = replace(
     _KITTI,
     name="SemanticKITTI, preprocessed",
-    files={"labels": "labels/{sequence=[0-9][0-9]}/{frame}_1_1.npy"},
+    files={
+        "labels": "labels/{sequence=[0-9][0-9]}/{frame}_1_1.npy",
+        "preprocess": "preprocess/labels/{sequence=[0-9][0-9]}/{frame}_1_1.npy",
+    },
     classes=SEMANTICKITTI19,
     read=read_preprocessed,
     poses=None,
@@ -257,7 +260,10 @@ PREPROCESSED = replace(
 SSCBENCH_PREPROCESSED = replace(
     PREPROCESSED,
     name="SSCBench, preprocessed",
-    files={"labels": "labels/{sequence=*_sync}/{frame}_1_1.npy"},
+    files={
+        name: template.replace("[0-9][0-9]", "*_sync")
+        for name, template in PREPROCESSED.files.items()
+    },
     classes=SSCBENCH,
     benchmark=("sscbench",),
 )
@@ -287,6 +293,7 @@ OPENOCCUPANCY_FILES = VoxelFormat(
     read_openoccupancy,
     benchmark=("openoccupancy",),
     place=_LIDAR,
+    y_forward=True,
 )
 SURROUNDOCC_FILES = VoxelFormat(
     "SurroundOcc",
@@ -297,6 +304,7 @@ SURROUNDOCC_FILES = VoxelFormat(
     holds=_Columns(4),
     benchmark=("surroundocc",),
     place=_LIDAR,
+    y_forward=True,
 )
 OCCNET_FILES = replace(
     SURROUNDOCC_FILES,

@@ -103,7 +103,7 @@ def run(task: Task) -> None:
     scans = WithoutScans(whole, hidden) if hidden else whole
     mistakes = ROWS[task.row]
     wrong = (
-        with_estimated_poses(scans)
+        with_estimated_poses(scans, FromScans())
         if mistakes is None
         else whole.with_poses(wrong_poses(whole.poses, **mistakes, seed=setting.seed))
     )

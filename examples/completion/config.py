@@ -67,6 +67,7 @@ class Config:
         save_every: number of steps after which last.pt is written within an epoch; 0 writes it
             after each epoch only.
         keep_samples: keep all samples in memory after the first epoch, for data that are small.
+        wandb: also log for Weights & Biases, without sending anything (`wandb sync` does that).
         seed: of weights, order, flips and draws.
     """
 
@@ -107,6 +108,7 @@ class Config:
     workers: int = 4
     save_every: int = 0
     keep_samples: bool = False
+    wandb: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:

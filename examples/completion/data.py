@@ -19,10 +19,11 @@ from torch.utils.data import DataLoader, DistributedSampler, Subset
 from torch.utils.data import Dataset as TorchDataset
 
 from carlasc import Dataset, Flip, ShardSampler, Source, collate
-from carlasc.core import CARLA, REMAPS, SEMANTICKITTI, SEMANTICKITTI19, TRAIN_VOXEL_COUNTS, Remap
+from carlasc.core import CARLA, SEMANTICKITTI, SEMANTICKITTI19, TRAIN_VOXEL_COUNTS, Remap
 from carlasc.dataset import Sample
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.metrics import CONVENTIONS
+from carlasc.storage import read_remap
 from completion.config import Config
 from completion.losses import FREE, IGNORE
 from completion.networks import KINDS
@@ -313,7 +314,11 @@ def class_weights(
                 found="table, which is for CarlaSC's",
             )
         weights = weights_of(
-            _merge(TRAIN_VOXEL_COUNTS, REMAPS.get(config.remap or ""), num_classes)
+            _merge(
+                TRAIN_VOXEL_COUNTS,
+                None if config.remap is None else read_remap(config.remap),
+                num_classes,
+            )
         )
     else:
         weights = _read_weights(Path(config.class_weights), data)

@@ -1,7 +1,12 @@
-"""Curves, and pictures of predictions beside the truth, for TensorBoard."""
+"""The logs of a run: scores per epoch for TensorBoard, as CSV and for Weights & Biases, and
+pictures of predictions beside the truth.
+"""
 
 from __future__ import annotations
 
+import csv
+import dataclasses
+import importlib
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,6 +18,7 @@ from torch import nn
 from carlasc import ClassTable, Dataset, collate
 from carlasc.errors import import_extra
 from carlasc.metrics import ConfusionMatrix
+from completion.config import Config
 from completion.scoring import predict
 from completion.tasks import task_of
 
@@ -20,15 +26,26 @@ _PICTURES = 3  # number of frames, spread over the split
 
 
 class Board:
-    """Writes TensorBoard's files; does nothing if it is not enabled."""
+    """Writes `tensorboard/` and `epochs.csv` of a run, and `wandb/` if the settings ask for it;
+    does nothing if it is not enabled.
+    """
 
-    def __init__(self, folder: Path, classes: ClassTable, *, enabled: bool = True) -> None:
-        self.classes = classes
+    def __init__(
+        self, out: Path, classes: ClassTable, config: Config, *, enabled: bool = True
+    ) -> None:
+        self.classes, self._table = classes, out / "epochs.csv"
         self._writer: Any = None
+        self._wandb: Any = None
         if enabled:
             import_extra("tensorboard", "torch")
             self._writer = import_extra("torch.utils.tensorboard", "torch").SummaryWriter(
-                str(folder)
+                str(out / "tensorboard")
+            )
+        if enabled and config.wandb:
+            settings = dataclasses.asdict(config)
+            # offline: `wandb sync` sends it
+            self._wandb = importlib.import_module("wandb").init(
+                project="carlasc", dir=out, mode="offline", config=settings
             )
 
     def __enter__(self) -> Self:
@@ -37,6 +54,8 @@ class Board:
     def __exit__(self, *_: object) -> None:
         if self._writer is not None:
             self._writer.close()
+        if self._wandb is not None:
+            self._wandb.finish()
 
     def add_epoch(
         self, epoch: int, loss: float, learning_rate: float, matrix: ConfusionMatrix
@@ -54,9 +73,17 @@ class Board:
             f"val_class/{name}": float(matrix.iou[index])
             for index, name in self.classes.names.items()
         }
-        for name, value in scalars.items():
-            if np.isfinite(value):
-                self._writer.add_scalar(name, value, epoch)
+        finite = {name: value for name, value in scalars.items() if np.isfinite(value)}
+        for name, value in finite.items():
+            self._writer.add_scalar(name, value, epoch)
+        if self._wandb is not None:
+            self._wandb.log(finite, step=epoch)
+        is_new = not self._table.exists()
+        with self._table.open("a", newline="", encoding="utf-8") as file:
+            table = csv.DictWriter(file, ["epoch", *scalars])
+            if is_new:
+                table.writeheader()
+            table.writerow({"epoch": epoch, **finite})
 
     def add_pictures(
         self, epoch: int, network: nn.Module, data: Dataset, device: torch.device

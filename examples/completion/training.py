@@ -125,7 +125,7 @@ def train(
             write_checkpoint(out / LAST, states | dataclasses.asdict(progress))
         processes.wait()
 
-    with Board(out / "tensorboard", data.classes, enabled=processes.first) as board:
+    with Board(out, data.classes, config, enabled=processes.first) as board:
         while not progress.is_over(config):
             start = time.perf_counter()
             task_of(network).set_epoch(network, progress.epoch)
@@ -186,7 +186,7 @@ def _resume(out: Path, config: Config, parts: dict[str, Any]) -> Progress:
     if changed := [
         name
         for name in changed
-        if name not in ("epochs", "patience", "workers", "save_every", "keep_samples")
+        if name not in ("epochs", "patience", "workers", "save_every", "keep_samples", "wandb")
     ]:
         raise ConflictError(
             out / CONFIG,

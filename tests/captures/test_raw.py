@@ -193,8 +193,8 @@ INVALID = {  # folder -> (array that is written over it, what is expected and fo
     "beyond the table": (
         "labels0",
         np.full(300, 25, np.uint32),
-        "class ids 0..24 .*",
-        "25 in 300 of 300",
+        "class ids of carla",
+        r"25 \(300 times\) of 300",
     ),
     "short labels": (
         "labels0",

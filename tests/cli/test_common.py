@@ -193,3 +193,16 @@ def test_help_of_a_flag_names_no_value():
     (flag,) = (line for line in result.output.splitlines() if "--overwrite" in line)
     assert "bool" not in flag
     assert "int" in next(line for line in result.output.splitlines() if "--workers" in line).lower()
+
+
+def test_ctrl_c_after_the_result_ends_with_its_exit_code():
+    code = """
+import os, signal, time
+import carlasc.cli
+carlasc.cli.app = lambda: print("result")
+carlasc.cli.main()
+os.kill(os.getpid(), signal.SIGINT)
+time.sleep(60)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False, text=True)
+    assert (done.returncode, done.stdout) == (130, "result\n")

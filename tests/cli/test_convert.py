@@ -81,6 +81,10 @@ def test_failed_frames_are_listed_and_the_exit_code_is_1(source, tmp_path):
     result = run("convert", "kitti", source, tmp_path / "out", "--grids", "none")
     assert result.exit_code == 1
     assert "labels/000001.label: expected a label for each of 60 points, found 3" in result.stderr
+    assert "frame 2 waits for frame 1" in result.stderr  # its motion
+    assert "1 of 3 frames failed, and 2 wait for them" in result.stderr
+    result = run("convert", "kitti", source, tmp_path / "out", "--grids", "none", "--allow-gaps")
+    assert result.exit_code == 1
     assert "1 of 3 frames failed" in result.stderr
 
 

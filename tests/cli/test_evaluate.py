@@ -127,3 +127,16 @@ def test_files_of_semantickitti_are_scored_by_its_rules(tmp_path):
     # the first half of the road, from 2 to 3 m, is called a car
     assert near["class_iou"]["road"] == pytest.approx(0.0)
     assert near["scored_voxels"] < values["scored_voxels"] == 256 * 256 * 32
+
+
+def test_the_class_tables_and_absent_classes_are_printed(data):
+    result = run(*data, "--sequences", "Town10_Heavy")
+    assert (
+        "classes: predictions carla (assumed: no file names one); ground truth carla"
+        in result.output
+    )
+    assert run(*data, "--markdown").output.startswith("Semantic scene completion")
+    assert "| Network |" in run(*data, "--markdown").output
+    figures = json.loads(run(*data, "--json", "--allow-unknown").output)
+    assert figures["source_classes"] == [{"table": "carla", "found": "assumed"}]
+    assert run(*data, "--sequences", "Town99").exit_code == 1

@@ -6,6 +6,8 @@ import pytest
 from helpers.scenes import passing_car
 from typer.testing import CliRunner
 
+import carlasc
+from carlasc import FromScans, GridSpec, Run
 from carlasc.cli import app
 
 OPTIONS = ("--holdout", "--holdout-every", "3", "--window=-2:2", "--workers", "1")
@@ -17,7 +19,9 @@ def run(*arguments):
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
-    return passing_car.write_sequence(tmp_path_factory.mktemp("street"), frames=8)
+    folder = passing_car.write_sequence(tmp_path_factory.mktemp("street"), frames=8)
+    assert run(folder, "--accept", "poses-on-scans").exit_code == 0  # nothing faces along the walls
+    return folder
 
 
 def test_held_out_rays_are_printed_below_the_checks(street):
@@ -28,6 +32,17 @@ def test_held_out_rays_are_printed_below_the_checks(street):
     assert "Vehicle" in result.output
     assert "10-20 m" in result.output
     assert "that the vehicle itself drove through are occupied" in result.output
+
+
+def test_the_grid_that_exists_is_measured_and_ends_in_a_verdict(tmp_path):
+    folder = passing_car.write_sequence(tmp_path, frames=8)
+    spec = GridSpec.published().with_resolution(0.8)
+    carlasc.regrid(folder, spec, observe=FromScans(window=(-2, 2)), run=Run(workers=1))
+    arguments = ("--holdout", "--holdout-every", "3", "--workers", "1")
+    result = run(folder, *arguments, "--accept", "poses-on-scans")
+    assert result.exit_code == 0, result.output
+    assert "held-out rays, cartesian 64 x 64 x 4, 2 scans left out" in result.output
+    assert result.output.endswith("held-out rays: tested and right\n")
 
 
 def test_held_out_rays_are_part_of_the_json(street):

@@ -29,6 +29,7 @@ def test_validate_of_sound_data_exits_0_and_says_so(sequence: Path) -> None:
     assert result.exit_code == 0, result.output
     assert "sound (0 errors, 0 warnings, 0 notes)" in result.output
     assert "of points in voxels of their class (evaluation)" in result.output
+    assert "tested and right: occupied, range, ground, poses-on-scans" in result.output
 
 
 def test_validate_of_broken_data_groups_what_it_found_and_exits_1(sequence: Path) -> None:
@@ -47,6 +48,18 @@ def test_validate_prints_a_few_of_a_kind_and_all_on_request(sequence: Path) -> N
     path.write_text(json.dumps(json.loads(path.read_text()) | {"grid_size": [64.0, 64.0, 8.0]}))
     assert "... and 3 more (--all prints them)" in run("validate", sequence).output
     assert "more (--all" not in run("validate", sequence, "--all").output
+
+
+def test_a_warning_of_the_record_exits_1_until_it_is_accepted(sequence: Path) -> None:
+    path = sequence / layout.METADATA
+    entry = {"check": "mount", "verdict": "warning", "message": "tilted"}
+    known = json.loads(path.read_text()) if path.exists() else {}
+    path.write_text(json.dumps(known | {"findings": [entry]}))
+    assert run("validate", sequence).exit_code == 1
+    assert "accepted: mount" in run("validate", sequence, "--accept", "mount").output
+    result = run("validate", sequence, "--json", "--full")
+    assert (result.exit_code, json.loads(result.stdout)["verdict"]) == (0, "sound")
+    assert run("validate", sequence, "--accept", "grund").exit_code == 2
 
 
 def test_validate_prints_json_with_its_exit_code(sequence: Path) -> None:

@@ -72,7 +72,9 @@ def cut(path: Path) -> bytes:
     return whole
 
 
-@pytest.mark.parametrize("field", ["velodyne/000003.bin", "labels/000002.label"])
+@pytest.mark.parametrize(
+    "field", ["labels/000002.label", pytest.param("velodyne/000003.bin", marks=pytest.mark.slow)]
+)
 def test_a_damaged_file_that_is_repaired(tmp_path, field):
     folder = write_drive(tmp_path / "in")
     whole = cut(folder / field)
@@ -103,7 +105,14 @@ def grow(folder: Path) -> None:
     shutil.copytree(longer, folder, dirs_exist_ok=True)
 
 
-@pytest.mark.parametrize("change", [change_labels, change_points, remove_labels, grow])
+@pytest.mark.parametrize(
+    "change",
+    [
+        change_labels,
+        remove_labels,
+        *(pytest.param(change, marks=pytest.mark.slow) for change in (change_points, grow)),
+    ],
+)
 def test_a_changed_data_set(tmp_path, change):
     folder = write_drive(tmp_path / "in")
     grids = None if change is remove_labels else GRIDS  # these would have another source of motion

@@ -5,7 +5,14 @@ import pytest
 from helpers.datasets.recordings import MemoryFrame, MemoryRecording, MemoryWriter
 
 from carlasc.converting import Cloud, Sensor, Trajectory, VoxelContent
-from carlasc.converting.assembling import AxesAndClasses, Rig, VehicleMotion, assemble, make_fields
+from carlasc.converting.assembling import (
+    AxesAndClasses,
+    LayoutOptions,
+    Rig,
+    VehicleMotion,
+    assemble,
+    make_fields,
+)
 from carlasc.converting.plans import (
     begin,
     choose_recordings,
@@ -333,9 +340,8 @@ def test_estimated_poses_of_an_earlier_run_are_used_in_right_handed_axes():
         recording_of(None),
         Lab,
         MemorySink(writer),
-        LEFT,
+        LayoutOptions(flow="none"),
         PoseOptions("kiss-icp"),
-        flow=False,
         voxels=False,
     )
     begin(plan, LEFT, Metadata())
@@ -353,9 +359,8 @@ def test_poses_of_another_origin_are_a_conflict():
         recording_of(poses),
         Lab,
         MemorySink(writer),
-        LEFT,
+        LayoutOptions(flow="none"),
         PoseOptions("file", force=True),
-        flow=False,
         voxels=False,
     )
     with pytest.raises(ConflictError, match="expected poses from file, found kiss-icp"):

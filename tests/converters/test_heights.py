@@ -10,7 +10,7 @@ import carlasc
 from carlasc.converting import LayoutOptions, Sensor, convert
 from carlasc.core import GridSpec, translation
 from carlasc.groundtruth import FromScans, GridOptions
-from carlasc.groundtruth.options import fit_to_ground, share_below
+from carlasc.groundtruth.options import fit_to_ground, fit_to_reach, share_below
 from carlasc.motion import MotionOptions
 from carlasc.motion.ground import find_ground
 from carlasc.running import Run
@@ -143,3 +143,21 @@ def test_no_ground_is_no_height():
     ground = find_ground([wall], 25.0)
     assert ground is None or share_below(ground, COARSE) == 0
     assert ground is None or fit_to_ground(COARSE, ground).size == COARSE.size
+
+
+@pytest.mark.parametrize(
+    ("spec", "reach_m", "size", "side_m"),
+    [
+        (COARSE, 5.0, (128, 128, 32), 6.4),
+        (COARSE, 12.0, (128, 128, 16), 12.8),
+        (COARSE, 13.0, COARSE.size, 25.6),
+        (COARSE.with_resolution(0.2), 5.0, (64, 64, 15), 6.4),
+        (GridSpec.published("fine"), 5.0, (256, 256, 16), 25.6),
+        (GridSpec.published("cylindrical"), 5.0, (128, 128, 8), 30.0),
+    ],
+)
+def test_grids_fit_the_reach_of_the_points_of_a_room(spec, reach_m, size, side_m):
+    fitted = fit_to_reach(spec, reach_m)
+    assert fitted.size == size
+    assert fitted.upper[0] == pytest.approx(side_m)
+    assert fitted.lower[2] == spec.lower[2] and fitted.upper[2] == pytest.approx(spec.upper[2])

@@ -27,8 +27,9 @@ from carlasc_converters.scans import Scans
 from helpers.converters import bags
 from helpers.errors import raises
 
+from carlasc.converting.assembling import Rig, VehicleMotion, read_scan
 from carlasc.converting.plausibility import check_scan
-from carlasc.core.geometry import quaternions_of, transform_points, translation
+from carlasc.core.geometry import quaternions_of, rotation_z, transform_points, translation
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.testing import SimulatedDrive
 from carlasc.testing.drives import world_T_sensor
@@ -454,3 +455,93 @@ def test_whole_data_with_a_wrong_size_of_rows_are_read():
 def test_the_times_of_a_survey_are_not_those_of_a_scan():
     with raises(FormatError, expected="at most 3 s", found="4414"):
         point_seconds(np.linspace(245369, 249783, 9), "s", "x")
+
+
+@pytest.mark.parametrize("rolling", [True, False])
+def test_a_lidar_that_moves_on_the_vehicle_is_placed_by_the_transforms(tmp_path, rolling):
+    drive = replace(DRIVE, rolling=rolling, frames=4)
+    mount, name = drive.sensors[0].vehicle_T_sensor, drive.sensors[0].name
+
+    def turn(seconds):
+        return rotation_z(0.8 * np.sin(4.0 * seconds))
+
+    def messages(store):
+        found = [one for one in bags.drive_messages(store, drive) if one[0] != "/tf_static"]
+        found = [one for one in found if not one[0].endswith("/points")]
+        for frame, seconds in enumerate(drive.times):
+            scan = drive.scan(frame)
+            turns = np.array([turn(seconds + after) for after in scan.seconds])
+            points = scan.points.copy()
+            points[:, :3] = np.einsum("nji,nj->ni", turns[:, :3, :3], points[:, :3])
+            cloud = bags.velodyne(points, scan.seconds if rolling else None)
+            stamp = bags.START_NS + round(seconds * 1e9)
+            found.append(store.cloud(f"/{name}/points", stamp, cloud, name))
+        for seconds in np.arange(-0.1, drive.times[-1] + 0.1, 0.005):
+            stamp = bags.START_NS + round(seconds * 1e9)
+            found.append(store.transform("/tf", stamp, bags.BASE, name, mount @ turn(seconds)))
+        found.append(store.transform("/tf_static", bags.START_NS, bags.BASE, "imu", mount))
+        return sorted(found, key=lambda message: message[2])
+
+    store = bags.Messages("mcap")
+    bag = bags.write_bag(tmp_path, "mcap", messages(store), store=store)
+    (recording,) = Bag(bag).sequences()
+    trajectory = recording.poses()
+    for frame, handle in enumerate(recording.frames):
+        motion = VehicleMotion(trajectory, recording.times()[frame])
+        scan = read_scan(handle, Rig.of(recording), motion)
+        np.testing.assert_allclose(scan.points[:, :3], drive.scan(frame).deskewed[:, :3], atol=0.01)
+    said = " ".join(recording.notes())
+    assert f"{name} moves on {bags.BASE}" in said
+    assert f"transforms that were not used: {bags.BASE} > imu" in said
+
+
+@pytest.mark.parametrize("degrees", [90, 135, 180])
+def test_the_order_of_quaternions_is_found_for_any_heading(tmp_path, degrees):
+    for frame in range(3):
+        write_pcd(tmp_path / "s" / f"{frame}.pcd", points_of(frame))
+    turn = rotation_z(np.deg2rad(degrees))
+    poses = np.stack([turn @ pose_of(frame) for frame in range(3)])
+    turns = quaternions_of(poses[:, :3, :3])  # w first
+    np.savetxt(tmp_path / "poses.txt", np.column_stack([np.arange(3) / 10, poses[:, :3, 3], turns]))
+    (recording,) = Scans(tmp_path / "s", pose_file=str(tmp_path / "poses.txt")).sequences()
+    found = recording.poses()
+    certain = degrees != 180  # else the ground is below in both, and the overlap of scans decides
+    assert (found.other is None) == certain
+    np.testing.assert_allclose(found.world_T_vehicle if certain else found.other, poses, atol=1e-9)
+
+
+def test_points_in_the_frame_of_a_map_projection_keep_their_millimetres(tmp_path):
+    offset = translation((500123.456, 5400321.789, 250.0))
+    for frame in range(3):
+        pose = offset @ pose_of(frame)
+        points = transform_points(pose, DRIVE.scan(frame).points[:, :3].astype(np.float64))
+        numbers = (*pose[:3, 3], *quaternions_of(pose[None, :3, :3])[0])
+        columns = dict(zip("xyz", points.T, strict=True))
+        write_pcd(tmp_path / "s" / f"{frame}.pcd", columns, numbers)
+    (recording,) = Scans(tmp_path / "s").sequences()
+    for frame, handle in enumerate(recording.frames):
+        (cloud,) = handle.read()
+        np.testing.assert_allclose(cloud.points[:, :3], DRIVE.scan(frame).points[:, :3], atol=1e-3)
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_scans_without_labels_among_others_are_unlabelled(tmp_path, beside):
+    (tmp_path / "labels").mkdir()
+    for frame in range(3):
+        columns, labels = points_of(frame), np.full(len(DRIVE.scan(frame).points), 40, np.uint32)
+        if frame != 1 and beside:
+            labels.tofile(tmp_path / "labels" / f"{frame}.label")
+        elif frame != 1:
+            columns["label"] = labels
+        write_pcd(tmp_path / "s" / f"{frame}.pcd", columns)
+    options = {"label_dir": str(tmp_path / "labels")} if beside else {}
+    (recording,) = Scans(tmp_path / "s", source_classes="semantickitti", **options).sequences()
+    clouds = [handle.read()[0] for handle in recording.frames]
+    assert [set(cloud.labels.tolist()) for cloud in clouds] == [{40}, {0}, {40}]
+    if beside:
+        assert any("1 of 3 scans have no file of labels" in note for note in recording.notes())
+        for file in (tmp_path / "labels").iterdir():
+            file.unlink()
+        (recording,) = Scans(tmp_path / "s", source_classes="semantickitti", **options).sequences()
+        with raises(MissingDataError, where="labels", found="none for any scan"):
+            recording.frames  # noqa: B018

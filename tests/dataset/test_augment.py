@@ -246,9 +246,10 @@ def test_axes_are_mirrored_if_they_are_asked_for(tmp_path):
         write_drive(tmp_path / name / "cartesian", range(3), spec=SQUARE, metadata=about, seed=3)
     with raises(FormatError, found="right", advice="`axes`"):
         Dataset(tmp_path)
-    dataset = Dataset(tmp_path, history=2, axes="left", fields=FIELDS)
-    assert dataset.axes == "left" and len(dataset) == 6
-    left, right = dataset[2], dataset[5]  # equal files
+    data = [Dataset(tmp_path / name, history=2, fields=FIELDS) for name in "AB"]
+    assert [one.axes for one in data] == ["left", "right"]
+    data[1].axes = "left"
+    left, right = data[0][2], data[1][2]  # equal files
     np.testing.assert_array_equal(right["points"], left["points"] * np.float32([1, -1, 1]))
     for name in ("labels", "known", "counts"):
         np.testing.assert_array_equal(right[name], left[name][:, ::-1])
@@ -256,7 +257,10 @@ def test_axes_are_mirrored_if_they_are_asked_for(tmp_path):
     np.testing.assert_array_equal(right["density"].sum((1, 3)), flipped["density"].sum((1, 3)))
     assert (right["density"] != flipped["density"]).mean() < 0.01  # points on faces of cells
     with raises(ArgumentError, where="^axes$"):
-        Dataset(tmp_path, axes="up")
+        data[0].axes = "up"
+    with raises(ArgumentError, where="flip of y"):
+        ahead = GridSpec("cartesian", (4, 4, 4), (0.0, 0.0, -2.0), (8.0, 8.0, 1.0))
+        Dataset(tmp_path / "A", grid=ahead, fields=("occupancy",)).axes = "right"
 
 
 def test_several_sources_are_one_data_set(tmp_path):

@@ -6,8 +6,10 @@ import sys
 import numpy as np
 import pytest
 from helpers.datasets.drives import write_drive
+from helpers.errors import raises
 
-from carlasc import Dataset, GridSpec, ShardSampler
+from carlasc import Dataset, Flip, GridSpec, ShardSampler, collate, collate_sparse
+from carlasc.errors import ArgumentError
 
 pytest.importorskip("torch", reason="needs carlasc[torch]")
 
@@ -64,3 +66,51 @@ def test_tensors_can_be_indexed_with_and_computed_with(drive):
     batch = default_collate([dataset[torch.tensor(1)], dataset[np.int64(2)]])
     assert batch["frame"].tolist() == [1, 2]
     assert (batch["density"] + 1).max() > 1 and batch["density"].sum() > 0
+
+
+def test_classes_are_counted_per_sample(drive):
+    dataset = Dataset(drive, fields=("occupancy", "labels", "known", "point_labels"), history=2)
+    dataset.transform = Flip(seed=0)
+    counts = dataset.class_counts()
+    by_hand = [
+        [(sample["labels"][sample["known"]] == k).sum() for k in range(11)]
+        for sample in Dataset(drive, fields=("labels", "known"))
+    ]
+    assert counts.dtype == np.int64 and counts.tolist() == np.array(by_hand).tolist()
+    points = dataset[:2].class_counts("point_labels")
+    assert points.sum(axis=1).tolist() == [300, 300]
+    with raises(ArgumentError, where="^field$", expected="labels", found="occupancy"):
+        dataset.class_counts("occupancy")
+
+
+@pytest.mark.parametrize("fields", [("occupancy",), ("visibility", "density")])
+def test_sparse_batches_hold_what_dense_ones_do(drive, fields):
+    import torch
+
+    dataset = Dataset(drive, fields=(*fields, "labels", "points"), history=3)
+    samples = [dataset[i] for i in (4, 0, 5)]
+    batch, dense = collate_sparse(samples), collate(samples)
+    indices, features = batch["indices"], batch["features"]
+    assert (indices.dtype, features.dtype) == (torch.int32, torch.float32)
+    assert batch.keys() == dense.keys() - set(fields) | {"indices", "features"}
+    assert len(torch.unique(indices, dim=0)) == len(indices) and (features != 0).any(1).all()
+    stacks = torch.cat([dense[name] for name in fields], dim=1).float()
+    again = torch.zeros_like(stacks).movedim(1, -1)
+    again[tuple(indices.long().T)] = features
+    assert torch.equal(again.movedim(-1, 1), stacks)
+    assert torch.equal(batch["labels"], dense["labels"])
+    with raises(ArgumentError, where="^samples$"):
+        collate_sparse([dataset[0] | dict.fromkeys(fields)][:0])
+
+
+@pytest.mark.slow
+@pytest.mark.needs("spconv")
+def test_spconv_takes_sparse_batches(drive):
+    import torch
+    from spconv.pytorch import SparseConvTensor
+
+    dataset = Dataset(drive, fields=("occupancy",), history=2)
+    batch = collate_sparse([dataset[1], dataset[2]])
+    tensor = SparseConvTensor(batch["features"], batch["indices"], list(SMALL.size), 2)
+    stacks = torch.stack([torch.from_numpy(dataset[i]["occupancy"]) for i in (1, 2)]).float()
+    assert torch.equal(tensor.dense(), stacks)

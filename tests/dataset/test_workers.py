@@ -7,7 +7,7 @@ import pytest
 from helpers.datasets.drives import write_drive
 
 from carlasc.core.grids import GridSpec
-from carlasc.dataset import FIELDS, Dataset, Flip, collate
+from carlasc.dataset import FIELDS, Augment, Dataset, Flip, collate
 
 pytest.importorskip("torch", reason="needs carlasc[torch]")
 
@@ -184,3 +184,23 @@ def test_a_pickled_dataset_has_the_same_samples_where_frames_are_missing(tmp_pat
     other = pickle.loads(pickle.dumps(dataset))
     for sample, again in zip(dataset, other, strict=True):
         assert all(np.array_equal(sample[name], again[name]) for name in sample)
+
+
+def test_seeded_augmentations_are_equal_for_every_number_of_workers(world):
+    dataset = Dataset(world, history=3, fields=(*DENSE, *RAGGED))
+    dataset.transform = Augment(
+        directions="xy", rotate_rad=1, scale=0.1, translate_m=1, drop=0.5, seed=7
+    )
+    alone = list(loader(dataset, 0, collate_fn=collate))
+    for workers in (2, 4):
+        same(list(loader(dataset, workers, collate_fn=collate)), alone)
+
+
+def test_without_a_seed_the_seed_of_torch_decides_in_workers(world):
+    dataset = Dataset(world, fields=("points",), transform=Augment(rotate_rad=1))
+    epochs = []
+    for seed in (0, 0, 1):
+        torch.manual_seed(seed)
+        epochs.append(list(loader(dataset, 2, collate_fn=collate)))
+    same(epochs[0], epochs[1])
+    assert not torch.equal(epochs[0][0]["points"][0], epochs[2][0]["points"][0])

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -59,6 +61,23 @@ def test_a_run_writes_weights_checkpoint_settings_and_curves(data, tmp_path, cap
     events.Reload()
     assert [e.value for e in events.Scalars("val/mIoU")] == pytest.approx(progress.mious)
     assert len(events.Tags()["images"]) == 3
+
+    with (tmp_path / "run" / "epochs.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["epoch"]) for row in rows] == [1, 2, 3, 4]
+    assert [float(row["val/mIoU"]) for row in rows] == pytest.approx(progress.mious)
+    assert [float(row["train/loss"]) for row in rows] == pytest.approx(progress.losses)
+
+
+@pytest.mark.slow
+@pytest.mark.needs("wandb")
+def test_weights_and_biases_logs_without_sending(data, tmp_path):
+    train(data, replace(QUICK, epochs=2, wandb=True), tmp_path / "run", ALONE)
+    (log,) = (tmp_path / "run" / "wandb").glob("offline-run-*/*.wandb")
+    end = time.monotonic() + 60  # its service writes the file after the run is finished
+    while b"train/loss" not in log.read_bytes() and time.monotonic() < end:
+        time.sleep(0.2)
+    assert b"val/mIoU" in log.read_bytes()
 
 
 @pytest.mark.slow

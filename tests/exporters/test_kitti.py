@@ -4,13 +4,16 @@ import numpy as np
 import pytest
 from carlasc_converters.exporters.kitti import TO_PREDICTED, TO_RAW
 from carlasc_converters.exporters.occlusion import occluded_voxels
+from carlasc_converters.kitti_files import Calibration
 from carlasc_converters.kitti_voxels import pack_bits, unpack_bits
+from converters.formats.kitti_drive import write_scan
 from helpers.datasets.exported import files_and_bytes, write_scene
 from helpers.datasets.sequences import write_dataset
 from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
 
-from carlasc.converting import export
+from carlasc.converting import convert, export
+from carlasc.core.geometry import invert
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import REMAPS
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
@@ -18,6 +21,7 @@ from carlasc.metrics import evaluate
 from carlasc.running import Run
 from carlasc.storage import FolderSink, layout
 from carlasc.storage.files import to_json
+from carlasc.testing import SimulatedDrive
 
 SEQUENCE = "Train/KITTI_00/cartesian"
 SPEC = GridSpec("cartesian", (10, 8, 5), (-2.0, -4.0, -2.0), (8.0, 4.0, 0.5))
@@ -440,3 +444,31 @@ def test_what_is_exported_is_scored_as_the_benchmark_scores_it(tmp_path):
     assert (result.convention.name, result.frames, result.failures) == ("semantickitti", 2, [])
     scored = {name: value for name, value in result.class_iou.items() if not np.isnan(value)}
     assert scored == {"car": 1.0, "person": 1.0, "road": 1.0, "traffic-sign": 1.0}
+
+
+def test_a_calibration_goes_out_as_it_came_in(tmp_path):
+    drive = SimulatedDrive(frames=3)
+    folder = tmp_path / "in" / "sequences" / "00"
+    for frame in range(drive.frames):
+        write_scan(folder / "velodyne" / f"{frame:06d}.bin", drive.scan(frame).points)
+    camera_T_lidar = np.eye(4)
+    camera_T_lidar[:3] = [[0, -1, 0, 0.01], [0, 0, -1, -0.08], [1, 0, 0, -0.27]]
+    poses = camera_T_lidar @ drive.world_T_vehicle(drive.times) @ invert(camera_T_lidar)
+    poses = invert(poses[0]) @ poses
+    (folder / "poses.txt").write_bytes(layout.encode_poses(poses))
+    matrix = np.array([[718.9, 0, 607.2], [0, 718.9, 185.2], [0, 0, 1]])
+    lines = {
+        f"P{number}": np.column_stack([matrix, [shift, 0.1 * number, 0]])
+        for number, shift in enumerate((0.0, -386.1, 45.4, -337.3))
+    } | {"Tr": camera_T_lidar[:3]}
+    text = [f"{name}: {' '.join(map(str, rows.ravel()))}\n" for name, rows in lines.items()]
+    (folder / "calib.txt").write_text("".join(text))
+    convert("kitti", tmp_path / "in", tmp_path / "made", grids=None, run=Run(workers=1))
+    export("kitti", tmp_path / "made", tmp_path / "out", run=Run(workers=1))
+    out = tmp_path / "out" / "sequences" / "00"
+    found = Calibration.read(out / "calib.txt").values
+    assert set(found) == set(lines)
+    for name, rows in lines.items():
+        assert np.allclose(found[name], rows.ravel(), atol=1e-9)
+    written = layout.decode_poses((out / "poses.txt").read_bytes(), "poses.txt")
+    assert np.allclose(written, poses, atol=1e-9)

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from carlasc.core.cells import fast_azimuth
+from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import translation
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, SEMANTICKITTI
@@ -83,15 +84,15 @@ def random_points(rng: np.random.Generator, count: int, spec: GridSpec) -> NDArr
 
 
 def random_observation(
-    rng: np.random.Generator, spec: GridSpec, channels: int = 25, count: int = 150
+    rng: np.random.Generator, spec: GridSpec, classes: ClassTable = CARLA, count: int = 150
 ) -> Observation:
     pose = translation(rng.choice([0.0, 1.0], 3) * rng.uniform(-15, 15, 3) * (1, 1, 0.2))
     if rng.random() < 0.7:
         pose[:3, :3] = random_rotation(rng)
-    labels = rng.integers(0, channels, count) * (rng.random(count) < 0.9)
+    labels = rng.choice(list(classes.names), count) * (rng.random(count) < 0.9)
     return Observation(
         random_points(rng, count, spec),
-        labels.astype(np.uint8 if channels <= 256 else np.uint16),
+        labels.astype(np.uint8 if max(classes.names) < 256 else np.uint16),
         pose,
     )
 
@@ -136,7 +137,7 @@ def test_every_vote_is_that_of_the_plain_version(
 def test_ids_over_255_are_counted_apart(vote: str) -> None:
     rng = np.random.default_rng(1)
     spec = SPECS["around the sensor"]
-    observations = [random_observation(rng, spec, 260, 600) for _ in range(3)]
+    observations = [random_observation(rng, spec, SEMANTICKITTI, 600) for _ in range(3)]
     assert max(int(o.labels.max()) for o in observations) > 256
     assert_as_plain(observations, spec, classes=SEMANTICKITTI, rule=vote)
     assert count_votes(observations, spec, SEMANTICKITTI).to_sparse()["label"].dtype == np.uint16

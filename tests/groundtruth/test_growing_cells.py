@@ -1,9 +1,13 @@
 """The cells of a map do not depend on the order of scans, nor on how many fit into memory."""
 
+import errno
+
 import numpy as np
 import pytest
+from helpers.errors import raises
 from numpy.testing import assert_array_equal
 
+from carlasc.errors import StorageError
 from carlasc.groundtruth.maps.growing_cells import (
     STATIC,
     GrowingCells,
@@ -86,3 +90,12 @@ def test_probabilities_weigh_votes(tmp_path):
 def test_a_scan_without_points_adds_nothing(tmp_path):
     made = split(*rows_of_scan(np.empty((0, 3)), np.empty(0, np.uint16), None, STATIC, CELL_M))
     assert made == []
+
+
+def test_a_full_disk_is_named_with_the_file(tmp_path, monkeypatch):
+    def full(path, array):
+        raise OSError(errno.ENOSPC, "No space left on device")  # as NumPy raises it: without a name
+
+    monkeypatch.setattr(np, "save", full)
+    with raises(StorageError, where=str(tmp_path / "a")):
+        filled(tmp_path / "a", scans(2), 10**9)

@@ -251,6 +251,7 @@ def test_what_exists_stays_unless_it_is_to_be_replaced(drive, tmp_path):
     assert out.read_bytes() == before
     make(drive, out, frames="0:2", actors=True, overwrite=True)
     assert out.read_bytes() != before and sorted(path.name for path in tmp_path.iterdir()) == [
+        ".carlasc",
         "map.npz",
         "map_actors",
     ]

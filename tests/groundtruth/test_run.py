@@ -316,7 +316,7 @@ def test_a_store_with_one_writer_gets_its_frames_in_order_from_the_workers(tmp_p
     [
         (
             {"observe": "capture"},
-            "observe: expected one of FromCapture, FromScans, FromGrid, found 'capture'",
+            "observe: expected a FromCapture or a FromScans or a FromGrid or None, found 'capture'",
         ),
         ({"frames": (5, 5)}, "frames: expected a range that holds a frame, found 5:5"),
         ({"frames": "a:b"}, "frames: expected .*, found 'a:b'"),

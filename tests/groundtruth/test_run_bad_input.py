@@ -51,7 +51,7 @@ BAD = {  # the file of frame 101, what is done to it, what the message says
     "label beyond the table": (
         "labels1",
         _replace(np.full(300, 25, np.uint32)),
-        "expected class ids 0..24",
+        "expected class ids of carla, found 25",
     ),
     "points without label": (
         "labels1",

@@ -135,14 +135,14 @@ def test_frames_without_a_scan_take_the_estimated_pose_of_the_scan_before(tmp_pa
     sequence = write(tmp_path, straight(10, 6), frames=[0, 2, 5])
     sizes = []
 
-    def estimate(scans, times, max_range_m):
+    def estimate(scans, times, max_range_m, voxel_m):
         sizes.extend(scan.shape for scan in scans)
         assert times == pytest.approx([0.0, 0.2, 0.5])
-        assert max_range_m == 100.0
+        assert (max_range_m, voxel_m) == (100.0, None)
         return np.stack([translation((number, 0, 0)) for number in range(len(sizes))])
 
     monkeypatch.setattr("carlasc.groundtruth.from_scans.sequences.estimate_poses", estimate)
-    estimated = with_estimated_poses(sequence)
+    estimated = with_estimated_poses(sequence, FromScans())
     assert sizes == [(1, 3)] * 3
     assert estimated.poses[:, 0, 3].tolist() == [0, 0, 1, 1, 1, 2]
     assert [estimated.read_pose(frame)[0, 3] for frame in (0, 2, 5)] == [0, 1, 2]

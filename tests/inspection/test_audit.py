@@ -134,6 +134,17 @@ def test_the_actor_of_a_fault_is_named(town, tmp_path, fault, check):
     assert f"actor {actor} " in str(found[check])
 
 
+def test_an_actor_in_unknown_space_is_not_erased(town, tmp_path):
+    actor = planted.fastest(planted.sequence_of(town))
+
+    def unknown(sequence, frame, labels, counts):
+        voxels = planted.voxels_of(sequence, frame, frame, actor)
+        counts.reshape(-1)[voxels] = 0
+        return planted.erased(actor)(sequence, frame, labels, counts)
+
+    assert "erased actors" not in faults(planted.write_grids(town, tmp_path, unknown), town)
+
+
 SOURCES = {  # what shows motion -> how the recording is copied
     "flow": lambda town, out: planted.without_fields(town, out, "instances"),
     "boxes": planted.with_boxes,
@@ -416,3 +427,10 @@ def test_a_drift_of_five_centimetres_a_second_is_named(tmp_path):
         assert {check: verdict.value for check, verdict in found.items()} == pytest.approx(
             wanted, abs=0.011
         )
+    carlasc.regrid(
+        drifting, spec, observe=observe, frames=(20, 31), name="evaluation", run=Run(workers=1)
+    )
+    result = carlasc.audit(drifting, drifting)  # the same poses: not a fault of the grids
+    (drift,) = (one for one in result.verdicts["cartesian"] if one.check == "height drift")
+    assert drift.state == "sound" and drift.value == pytest.approx(0.05, abs=0.011)
+    assert "poses of the recording" in str(drift)

@@ -9,6 +9,7 @@ import json
 import logging
 import os
 import re
+import shutil
 import subprocess
 import sys
 import warnings
@@ -34,6 +35,11 @@ from carlasc.motion import PoseOptions
 from carlasc.testing.data import SCANS, WHOLE
 
 TOWN = "Train/Demo/cartesian"
+STATED: dict[str, Any] = {
+    "place": "Ann Arbor",
+    "citation": "@misc{data}",
+    "statements": {"personalSensitiveInformation": "Faces are blurred."},
+}
 SAID: dict[str, Any] = {"license": "cc-by-4.0", "published": "2026-11-22"}
 
 
@@ -42,7 +48,7 @@ def write_card(source: Any, out: Path | None = None, **given: Any) -> carlasc.in
     details = {
         field.name: given.pop(field.name) for field in fields(CardDetails) if field.name in given
     }
-    return carlasc.card(source, out, about=CardDetails(**details), **given)
+    return carlasc.card(source, out, about=CardDetails(**STATED | details), **given)
 
 
 def front_matter(folder: Path) -> dict[str, Any]:
@@ -414,7 +420,7 @@ def test_simulated_data_need_a_licence_from_their_author(tmp_path: Path) -> None
     root = write_dataset(tmp_path / "data")
     result = CliRunner().invoke(app, ["card", str(root), "--no-pictures"])
     assert (result.exit_code, len(result.stderr.splitlines())) == (2, 1)
-    assert "--license: expected the licence of these data" in result.stderr
+    assert "--license: expected license, statements" in result.stderr
     licensed(root, {WHOLE: None, SCANS: None})
     with pytest.raises(ArgumentError) as caught:
         write_card(root, pictures=False)
@@ -563,7 +569,9 @@ def test_a_published_store_is_addressed_at_the_hub(
 def test_frames_that_cannot_be_read_are_listed_and_end_with_1(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
     (root / WHOLE / "labels" / "000005.label").write_bytes(b"123")
-    result = CliRunner().invoke(app, ["card", str(root), "--license", "mit", "--no-pictures"])
+    result = CliRunner().invoke(
+        app, ["card", str(root), "--license", "mit", "--no-pictures", "--draft"]
+    )
     assert result.exit_code == 1
     assert "000005.label" in result.stderr
     assert "1 files could not be read" in (root / "README.md").read_text()
@@ -594,6 +602,14 @@ def test_the_command_prints_what_it_wrote(tmp_path: Path) -> None:
     result = CliRunner().invoke(
         app, ["card", str(root), *arguments, "--no-pictures", "--json", "-o", str(tmp_path / "c")]
     )
+    assert result.exit_code == 2
+    assert "--statements: expected statements (personalSensitiveInformation), place" in (
+        result.stderr
+    )
+    arguments += ["--place", "Ann Arbor", "--draft"]
+    result = CliRunner().invoke(
+        app, ["card", str(root), *arguments, "--no-pictures", "--json", "-o", str(tmp_path / "c")]
+    )
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
     assert found["files"] == [
@@ -615,9 +631,8 @@ def test_the_card_of_converted_data_keeps_their_licence_and_names_their_authors(
         grids=None,
         run=Run(workers=1),
     )
-    assert write_card(tmp_path / "out", pictures=False, published="2026-11-22").licenses == (
-        "CC BY-NC-SA 3.0",
-    )
+    made = write_card(tmp_path / "out", pictures=False, published="2026-11-22", citation=None)
+    assert made.licenses == ("CC BY-NC-SA 3.0",)
     text, content = (tmp_path / "out" / "README.md").read_text(), croissant(tmp_path / "out")
     assert front_matter(tmp_path / "out")["license"] == "cc-by-nc-sa-3.0"
     assert "- kitti kitti: J. Behley et al., SemanticKITTI, ICCV 2019" in text
@@ -629,27 +644,34 @@ def test_the_card_of_converted_data_keeps_their_licence_and_names_their_authors(
 
 def test_data_are_called_simulated_only_if_they_say_so(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
-    claims = ("simulat", "CARLA server", "personalSensitiveInformation", "hasSyntheticData")
+    claims = ("simulat", "CARLA server", "MotionSC", "pip install", "hasSyntheticData")
     for licenses in ({}, dict.fromkeys(carlasc.open(root).sequences(), "MIT")):
         licensed(root, licenses)
-        given = {} if licenses else SAID
+        given = {"statements": {}, "draft": True, **({} if licenses else SAID)}
         result = write_card(root, pictures=False, overwrite=True, **given)
         for file in result.files:
             assert not [claim for claim in claims if claim in file.read_text()]
         assert any("personal data" in note for note in result.notes)
         assert "Not stated by the author: " in (root / "README.md").read_text()
-    file = root / WHOLE / "carlasc.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | {"simulated": True}))
-    write_card(root, pictures=False, overwrite=True)
-    assert croissant(root)["rai:hasSyntheticData"] is True
-    assert "simulation" in front_matter(root)["tags"]
-    assert "recorded in a simulator" in croissant(root)["description"]
+        assert "**This is a draft. " in (root / "README.md").read_text()
+        assert croissant(root)["creativeWorkStatus"] == "Draft"
+        assert "rai:personalSensitiveInformation" not in croissant(root)
+    paths = list(carlasc.open(root).sequences())
+    for number, path in enumerate(paths, 1):
+        file = root / path / "carlasc.json"
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"simulated": True}))
+        write_card(root, pictures=False, overwrite=True)
+        assert croissant(root)["rai:hasSyntheticData"] is True
+        assert "simulation" in front_matter(root)["tags"]
+        part = "" if number == len(paths) else f"{number} of {len(paths)} sequences "
+        assert f", {part}recorded in a simulator" in croissant(root)["description"]
 
 
 def test_statements_are_shown_as_the_author_wrote_them(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
     (tmp_path / "said.toml").write_text('personalSensitiveInformation = "Faces are blurred."')
     command = ["card", str(root), "--license", "mit", "--no-pictures", "--overwrite"]
+    command += ["--place", "Ann Arbor", "--draft"]
     result = CliRunner().invoke(app, [*command, "--statements", str(tmp_path / "said.toml")])
     assert result.exit_code == 0, result.output
     assert "Personal data\n\nFaces are blurred.\n" in (root / "README.md").read_text()
@@ -676,3 +698,89 @@ def test_rounded_coordinates_are_said(town: Path, tmp_path: Path) -> None:
     text = (tmp_path / "x.parquet" / "README.md").read_text()
     assert "`x`, `y` and `z` are whole numbers of 2 mm." in text
     assert "Coordinates of points are rounded to steps of 2 mm." in text
+
+
+def test_each_line_of_a_card_is_what_the_data_say(town: Path, tmp_path: Path) -> None:
+    """Five kinds of sources: simulated, packed, converted, own recordings, and a mixture."""
+    write_tiny_kitti(tmp_path / "kitti", frames=2)
+    carlasc.convert(
+        "kitti",
+        tmp_path / "kitti",
+        tmp_path / "converted",
+        poses=PoseOptions(source="file"),
+        grids=None,
+        run=Run(workers=1),
+    )
+    carlasc.pack(town, tmp_path / "town.h5", run=Run(workers=1))
+    mixture = write_dataset(tmp_path / "mixture")
+    shutil.copytree(town / "Train" / "Demo", mixture / "Train" / "Demo")
+    sources = {
+        "simulated": town,
+        "packed": tmp_path / "town.h5",
+        "converted": tmp_path / "converted",
+        "own": write_dataset(tmp_path / "own"),
+        "mixture": mixture,
+    }
+    for kind, source in sources.items():
+        out = tmp_path / "cards" / kind
+        about = carlasc.open(source).sequences()
+        simulated = [one.metadata.extra.get("simulated") is True for one in about.values()]
+        assert all(simulated) == (kind in ("simulated", "packed"))
+        if kind != "converted":
+            with pytest.raises(ArgumentError) as caught:
+                carlasc.card(source, out, pictures=False)
+            needed = "license" if all(simulated) else "license, statements .*, place, citation"
+            assert caught.value.where == "license" and not out.exists()
+            assert re.match(needed + " of /", caught.value.expected)
+        license_ = None if kind == "converted" else "cc-by-4.0"
+        details = CardDetails(license=license_, published="2026-11-22")
+        draft = carlasc.card(source, out, about=details, draft=True, pictures=False)
+        text = (out / "README.md").read_text()
+        assert ("This is a draft" in text) != all(simulated)
+        assert any("This is a draft" in note for note in draft.notes) != all(simulated)
+        checked = dict(STATED) if not all(simulated) else {}
+        carlasc.card(
+            source,
+            out,
+            about=CardDetails(license=license_, published="2026-11-22", **checked),
+            pictures=False,
+            overwrite=True,
+        )
+        check_lines(out, about, checked)
+
+
+def check_lines(out: Path, about: Any, stated: dict[str, Any]) -> None:
+    """Check each statement of README.md and croissant.json about the origin of the data."""
+    text, content = (out / "README.md").read_text(), croissant(out)
+    glance = dict(
+        [cell.strip() for cell in line.strip("|").split(" | ")]
+        for line in text.partition("## Open it")[0].splitlines()
+        if line.startswith("| ") and line.count(" | ") == 1
+    )
+    said = [one.metadata for one in about.values()]
+    simulated = sum(one.extra.get("simulated") is True for one in said)
+    shown = {0: None, len(said): "all"}.get(simulated, f"{simulated} of {len(said)} sequences")
+    assert glance.get("simulated") == shown
+    assert content.get("rai:hasSyntheticData", False) is bool(simulated)
+    assert ("simulation" in front_matter(out)["tags"]) is bool(simulated)
+    assert ("recorded in a simulator" in text) is bool(simulated)
+    frames = sum(len(one.scan_frames()) for one in about.values())
+    assert glance["frames"] == f"{frames} in {len(said)} sequence{'s' * (len(said) > 1)}"
+    assert (
+        glance["sensors"] == ", ".join(sorted({s.sensor for s in said if s.sensor})) or "not named"
+    )
+    assert glance["axes"] == " and ".join(sorted({one.axes for one in said})) + "-handed"
+    assert glance.get("place") == stated.get("place") == content.get("spatialCoverage")
+    assert ("Faces are blurred." in text) is bool(stated)
+    assert "Personal data" not in text or stated
+    sources = {one.source: one.extra.get("citation") for one in said if one.source}
+    citation = text.partition("## Citation")[2]
+    for source, paper in sources.items():
+        assert f"- {source}: {paper}" in citation
+    assert ("@misc{data}" in citation) is bool(stated)
+    assert "MotionSC" not in text and "MotionSC" not in json.dumps(content)
+    assert "pip install" not in text and "This is a draft" not in text
+    assert "creativeWorkStatus" not in content
+    assert set(content.get("prov:wasDerivedFrom", [])) == set(sources)
+    (licence,) = {one.extra.get("license", "CC BY 4.0") for one in said}
+    assert glance["licence"] == licence

@@ -74,8 +74,23 @@ def test_findings_are_grouped_by_check_with_errors_first():
 
 
 @pytest.mark.parametrize(("severity", "ok"), [("error", False), ("warning", True), ("note", True)])
-def test_only_errors_make_a_data_set_unsound(severity, ok):
+def test_errors_make_a_data_set_unsound(severity, ok):
     assert ValidationResult("place", (finding(severity),), ()).ok is ok
+
+
+@pytest.mark.parametrize(
+    ("states", "verdict"),
+    [
+        (("right", "accepted"), "sound"),
+        (("right", "untested"), "undetermined"),
+        (("untested", "wrong"), "not sound"),
+    ],
+)
+def test_the_checks_that_a_grid_needs_decide_the_verdict(states, verdict):
+    reports = [SequenceReport("A", 1, 1, checks={"ground": state}) for state in states]
+    result = ValidationResult("place", (), tuple(reports))
+    assert (result.verdict, result.ok) == (verdict, verdict == "sound")
+    assert result.to_dict()["verdict"] == verdict
 
 
 def test_a_result_as_a_dictionary_holds_all_of_it():
@@ -98,5 +113,6 @@ def test_a_result_as_a_dictionary_holds_all_of_it():
             "refined_m": None,
             "mounting": {},
             "images": {},
+            "checks": {},
         }
     ]

@@ -4,6 +4,7 @@ bad ones.
 
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
 from carlasc.groundtruth.inputs import GridPlan
-from carlasc.inspection import HeldOutScores, holdout
+from carlasc.inspection import HeldOutScores, HoldoutResult, holdout
 from carlasc.inspection.heldout_scores import VEHICLE_M, swept_voxels
 from carlasc.storage import FolderSink, layout
 
@@ -260,3 +261,22 @@ def test_a_window_without_another_scan_is_a_failure(bare):
 def test_wrong_arguments_are_refused(bare, wrong):
     with pytest.raises(ArgumentError):
         holdout(bare, **wrong)
+
+
+@pytest.mark.parametrize(
+    ("counts", "swept", "state", "fault"),
+    [
+        ((2000, 30, 0, 0, 600, 0), 10, "right", ""),
+        ((2000, 50, 0, 0, 600, 0), 10, "wrong", "2.5% of the returns"),
+        ((2000, 30, 0, 0, 1000, 0), 10, "wrong", "50.0% of the rays pass"),
+        ((2000, 30, 0, 0, 600, 0), 60, "wrong", "60.0% of what the vehicle"),
+        ((900, 800, 0, 0, 0, 0), 10, "untested", ""),
+    ],
+)
+def test_the_rays_end_in_a_verdict(counts, swept, state, fault):
+    empty = HeldOutScores.empty(CARLA)
+    empty.counts[1, 0] = counts
+    scores = replace(empty, swept_voxels=100, swept_known=100, swept_occupied=swept)
+    result = HoldoutResult("here", GridSpec.published(), 10, {"A": scores})
+    assert (result.state, result.to_dict()["state"]) == (state, state)
+    assert result.faults.get("A", "").startswith(fault)

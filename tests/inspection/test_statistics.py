@@ -129,7 +129,7 @@ def test_a_bad_frame_is_listed_and_the_others_are_counted(
         ["labels", "000002"],
         ["evaluation/labels", "000001"],
     ]
-    assert "found 77 in 100 of 100" in result.failures[0][1]
+    assert "found 77 (100 times) of 100 labels" in result.failures[0][1]
     assert (result.total.scans, result.total.grids) == (14, 14)
 
 

@@ -10,6 +10,7 @@ from helpers.references.whole_drives import find_actors, link_segments
 from helpers.scenes.moving_scenes import CAR, PERSON, WALL, WALLS, box, car, film, person
 
 from carlasc.captures.settings import Lidar
+from carlasc.motion.tracks import MovingActors
 
 
 def actors(scene, frames=40, **options):
@@ -133,12 +134,26 @@ def test_points_on_the_recording_vehicle_are_found_and_are_no_actor():
     ]
     found = find_actors(filmed)
     assert found.tracked == ()
-    (corners,) = found.own
-    assert (
-        (rack > corners[:3]).all()
-        and (rack < corners[3:]).all()
-        and np.ptp(corners.reshape(2, 3), axis=0).max() < 1
+    corners = np.stack(found.own)
+    assert MovingActors(own=found.own).is_own(rack).all()
+    assert np.ptp(corners.reshape(-1, 3), axis=0).max() < 1
+
+
+def test_parts_of_the_recording_vehicle_may_be_anywhere_and_a_person_beside_it_is_none():
+    rng = np.random.default_rng(1)
+    sill = rng.uniform((-1.1, 1.2, -0.7), (-0.8, 1.45, -0.5), (25, 3)).astype(np.float32)
+    filmed = film(
+        lambda t: [*WALLS, person(t + 0.3 * np.sin(t), -1.6 + 0.2 * np.sin(2 * t))],
+        40,
+        ego_m_s=1.0,
     )
+    found = find_actors(
+        replace(scan, points=np.concatenate([scan.points, sill])) for scan, _ in filmed
+    )
+    assert MovingActors(own=found.own).is_own(sill).all()
+    assert np.ptp(np.stack(found.own).reshape(-1, 3), axis=0).max() < 1  # the person is none
+    (actor,) = found.tracked
+    assert actor.segments[0].points[:, 1].mean() < 0
 
 
 def test_a_car_beside_the_sensor_that_keeps_its_speed_is_not_the_recording_vehicle():

@@ -1,11 +1,15 @@
+from collections import deque
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from carlasc.converting import Sensor
 from carlasc.core.geometry import invert, rotation_z, transform_points, translation
 from carlasc.errors import ArgumentError
-from carlasc.motion.odometry import estimate_poses
-from carlasc.testing.drives import SimulatedDrive, Thing
+from carlasc.motion.odometry import estimate_poses, follow_scans, usable_points
+from carlasc.testing import SCENES
+from carlasc.testing.drives import SimulatedDrive, Thing, world_T_sensor
 
 pytest.importorskip("kiss_icp")
 
@@ -175,3 +179,40 @@ def test_seconds_must_be_those_of_the_points():
         with pytest.raises(ArgumentError) as error:
             estimate_poses(scans, seconds=seconds)
         assert "200 of scan 1" in error.value.expected and error.value.found == found
+
+
+def scene_errors(name, frames):
+    """Return the greatest error of the position as a share of the way, and what was chosen."""
+    drive, said = replace(SCENES[name], frames=frames), []
+    scans = [drive.scan(frame) for frame in range(frames)]
+    chosen = [usable_points(scan.points) for scan in scans]
+    usable = [(s.points[u, :3], s.seconds[u]) for s, u in zip(scans, chosen, strict=True)]
+    estimated = np.stack(list(follow_scans(usable, times=drive.times, note=said.append)))
+    true = np.stack([world_T_sensor(drive, frame) for frame in range(frames)])
+    true = invert(true[0]) @ true
+    way = np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum()
+    return np.linalg.norm((estimated - true)[:, :3, 3], axis=1).max() / way, said
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "room",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("walking-robot", "drone", "pitched")
+        ),
+    ],
+)
+def test_carriers_other_than_cars_are_followed_within_two_percent(name):
+    error, said = scene_errors(name, 12 if name == "room" else 40)
+    assert error < 0.02
+    (line,) = said
+    assert line.startswith("odometry by planes: points within ")
+
+
+def test_a_street_needs_no_note():
+    drive = SimulatedDrive(frames=2, channels=32, columns=360)
+    said = []
+    deque(follow_scans([(drive.scan(f).points[:, :3], None) for f in (0, 1)], note=said.append))
+    assert said == []

@@ -19,7 +19,13 @@ import carlasc
 from carlasc import Run
 from carlasc.cli import app
 from carlasc.core.tables import remap_named
-from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
+from carlasc.errors import (
+    ArgumentError,
+    CompleteError,
+    ConflictError,
+    FormatError,
+    MissingDataError,
+)
 from carlasc.inspection import card, report, validate
 from carlasc.storage import open as open_store
 from carlasc.testing import write_dataset
@@ -35,7 +41,7 @@ def files_of(folder):
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in folder.rglob("*")
-        if path.is_file()
+        if path.is_file() and ".carlasc" not in path.parts
     }
 
 
@@ -194,8 +200,10 @@ def test_what_exists_is_not_replaced_unless_it_was_labelled_and_that_is_asked_fo
     data, predictions, tmp_path
 ):
     carlasc.label(data, tmp_path / "out", tmp_path / "net", run=ALONE)
-    with pytest.raises(ConflictError) as error:
+    with pytest.raises(CompleteError):
         carlasc.label(data, tmp_path / "out", tmp_path / "net", run=ALONE)
+    with pytest.raises(ConflictError) as error:
+        carlasc.label(data, tmp_path / "out", tmp_path / "net", by="x", run=ALONE)
     assert error.value.expected == "a new path"
     carlasc.label(
         data, tmp_path / "out", tmp_path / "net", by="x", overwrite=True, frames=(0, 3), run=ALONE
@@ -215,6 +223,15 @@ def test_what_exists_is_not_replaced_unless_it_was_labelled_and_that_is_asked_fo
     for place in (data, data / "inside", tmp_path):
         with pytest.raises(ConflictError):
             carlasc.label(data, place, tmp_path / "net", overwrite=True, run=ALONE)
+
+
+def test_an_error_says_where_the_replaced_data_set_is(data, predictions, tmp_path):
+    carlasc.label(data, tmp_path / "out", tmp_path / "net", run=ALONE)
+    (tmp_path / "out.part").mkdir()  # of another run, which lost its mark
+    with pytest.raises(ConflictError) as error:
+        carlasc.label(data, tmp_path / "out", tmp_path / "net", overwrite=True, run=ALONE)
+    assert error.value.advice.endswith(str(tmp_path / "out.replaced"))
+    assert open_store(tmp_path / "out.replaced").sequences()[WHOLE].metadata.predicted
 
 
 KILLED = """
@@ -297,6 +314,7 @@ def test_a_record_a_report_and_a_card_say_who_predicted(data, predictions, tmp_p
         tmp_path / "card",
         about=carlasc.CardDetails(license="cc-by-4.0"),
         pictures=False,
+        draft=True,
         run=ALONE,
     )
     text = (tmp_path / "card/README.md").read_text()

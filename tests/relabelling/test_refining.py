@@ -18,7 +18,13 @@ import carlasc
 from carlasc import GridSpec, Run
 from carlasc.captures import Lidar
 from carlasc.core.geometry import invert, multiply, slerp, translation
-from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
+from carlasc.errors import (
+    ArgumentError,
+    CompleteError,
+    ConflictError,
+    FormatError,
+    MissingDataError,
+)
 from carlasc.inspection import validate
 from carlasc.motion import PoseOptions
 from carlasc.relabelling import refining
@@ -41,7 +47,7 @@ def files_of(folder):
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in folder.rglob("*")
-        if path.is_file()
+        if path.is_file() and ".carlasc" not in path.parts
     }
 
 
@@ -96,9 +102,9 @@ def data(exact, truth, tmp_path):
     shutil.copytree(exact / ONE, tmp_path / "data" / TWO, copy_function=os.link)
     shutil.copytree(exact / ONE, tmp_path / "data" / ONE, copy_function=os.link)
     write_poses(tmp_path / "data" / ONE, disturbed(truth))
-    (tmp_path / "data" / ONE / "carlasc.json").write_text(
-        '{"format": 2, "sensor": "a", "poses": "file"}'
-    )
+    described = tmp_path / "data" / ONE / "carlasc.json"
+    described.unlink()  # it is a link
+    described.write_text('{"format": 2, "sensor": "a", "poses": "file"}')
     return tmp_path / "data"
 
 
@@ -142,7 +148,13 @@ def test_carlasc_json_says_what_was_done_and_keeps_what_it_said(data, tmp_path):
         "sensor": "a",
         "poses": "file, refined",
     }
-    assert found[1] == {"format": 2, "axes": "left", "classes": "carla", "poses": "left as given"}
+    assert found[1] == {
+        "format": 2,
+        "axes": "left",
+        "classes": "carla",
+        "simulated": True,
+        "poses": "left as given",
+    }
     again = carlasc.refine(tmp_path / "out", tmp_path / "again", run=ALONE)
     assert again.refined == []
     for path in (ONE, TWO):
@@ -233,8 +245,10 @@ def test_too_few_scans_are_left_alone_and_sequences_without_scans_are_left_out(e
 
 def test_what_exists_is_not_replaced_unless_it_was_refined_and_that_is_asked_for(data, tmp_path):
     carlasc.refine(data, tmp_path / "out", run=ALONE)
-    with pytest.raises(ConflictError) as error:
+    with pytest.raises(CompleteError):
         carlasc.refine(data, tmp_path / "out", run=ALONE)
+    with pytest.raises(ConflictError) as error:
+        carlasc.refine(data, tmp_path / "out", poses=PoseOptions(refine="always"), run=ALONE)
     assert error.value.expected == "a new path"
     carlasc.refine(
         data, tmp_path / "out", poses=PoseOptions(refine="always"), overwrite=True, run=ALONE

@@ -6,6 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
+from helpers import foreign_voxels
 from helpers.scenes.road_blocks import write_blocks
 
 import carlasc
@@ -212,3 +213,12 @@ def test_data_with_y_on_the_left_say_so(tmp_path):
         tmp_path / "cartesian", frames=1, metadata={"frame": "kitti"}, points=False
     )
     assert not Scene(folder).open().left_handed
+
+
+def test_frames_with_tokens_are_compared_with_the_truth_of_the_same_token(tmp_path):
+    truth = foreign_voxels.write_occ3d(tmp_path / "occ3d", tokens=("aa0", "bb1"))
+    pred = foreign_voxels.write_challenge(tmp_path / "pred", tokens=("bb1",))
+    reader = Scene(pred, truth=truth).open()
+    assert reader.frames == (1,)
+    assert reader.data.sequence.frames_of["pred"].name_of(1) == "bb1"
+    assert reader.table_use.table == "occ3d"

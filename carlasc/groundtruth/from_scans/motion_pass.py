@@ -52,7 +52,7 @@ TRACKS, POSES = "tracks", "poses"
 
 # of the methods: a version changes only when the same input gives another result
 _VERSIONS = {
-    TRACKS: 5,
+    TRACKS: 6,
     POSES: 1,
 }
 _NOTED_M = 0.04  # if scans disagree by more and poses do not change, there is a note
@@ -151,6 +151,7 @@ def find_actors(
                 found += _estimate(feed, run, waiting)
                 waiting = []
     found += _estimate(feed, run, [*waiting, *map(_observed, follower.finish())])
+    found = [track for track in found if track.instance not in follower.riders]
     tracks += found
     moving = _untracked(follower.moved, found)
     return MovingActors.of(tracks if boxes else complete_bodies(tracks), moving, follower.own)

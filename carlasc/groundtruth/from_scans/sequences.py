@@ -158,6 +158,7 @@ class ScanSequence(StoredSequence):
         self.options = options
         self.actors = MovingActors()
         self.refined: RefinedPoses | None = None
+        self._is_prepared = False
 
     @cached_property
     def estimates_poses(self) -> bool:
@@ -179,7 +180,9 @@ class ScanSequence(StoredSequence):
             MissingDataError: there are no poses.
             FormatError: poses or times are not valid.
         """
-        sequence = with_estimated_poses(self.sequence) if self.estimates_poses else self.sequence
+        sequence = self.sequence
+        if self.estimates_poses:
+            sequence = with_estimated_poses(sequence, self.options)
         check_trajectory(sequence, self.options)
         return sequence
 
@@ -249,6 +252,9 @@ class ScanSequence(StoredSequence):
         """Refine the poses of the sequence, and find its actors, or read the results of an earlier
         run with `writer`.
         """
+        if self._is_prepared:
+            return
+        self._is_prepared = True
         if self.refines:
             self.use_refined(refine_sequence(self.feed, writer, run, steps))
         if self.feed.needs_actors:
@@ -425,8 +431,9 @@ def must_estimate(sequence: Sequence, options: FromScans) -> bool:
     return source == "kiss-icp" or (source == "auto" and layout.POSES not in sequence.documents())
 
 
-def with_estimated_poses(sequence: Sequence) -> Sequence:
-    """Return a sequence with poses estimated by KISS-ICP.
+def with_estimated_poses(sequence: Sequence, options: FromScans) -> Sequence:
+    """Return a sequence with poses estimated by odometry, from points within the range of the
+    options, in voxels of their size.
 
     Lines of frames without a scan repeat the pose of the last scan.
 
@@ -439,7 +446,10 @@ def with_estimated_poses(sequence: Sequence) -> Sequence:
     times = sequence.times_of(frames)
     try:
         poses = estimate_poses(
-            scans, times=times, max_range_m=sequence.metadata.max_range_m or _RANGE_M
+            scans,
+            times=times,
+            max_range_m=options.max_range_m or sequence.metadata.max_range_m or _RANGE_M,
+            voxel_m=options.poses.odometry_voxel_m,
         )
     except ArgumentError as error:  # an argument there, data here
         raise FormatError(

@@ -16,6 +16,7 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, IntArray, LabelArray
 from carlasc.groundtruth.maps.cloud_files import POINT_DTYPE
+from carlasc.storage.files import writing
 
 Part = tuple[int, int, int]
 """Cells that are kept together: a group (`STATIC`, or the number of an actor), and x and y of a
@@ -153,8 +154,18 @@ class GrowingCells:
             while self._held > self.most_rows // 2:  # the least recent ones first
                 part, (rows,) = self._rows.popitem(last=False)
                 self._held -= len(rows)
-                np.save(self._path(part), self._whole(part, [rows]))
+                self._save(part, self._whole(part, [rows]))
                 self._stored.add(part)
+
+    def _save(self, part: Part, rows: AnyArray) -> None:
+        """Write the rows of a part.
+
+        Raises:
+            StorageError: the file cannot be written.
+        """
+        path = self._path(part)
+        with writing(path):
+            np.save(path, rows)
 
     def _path(self, part: Part) -> Path:
         return self.folder / f"{'_'.join(map(str, part))}.npy"
@@ -170,7 +181,7 @@ class GrowingCells:
         for part in sorted({*self._rows, *self._stored}):
             points = self._elect(part, self._whole(part, self._rows.pop(part, [])))
             self.counts[part] = len(points)
-            np.save(self._path(part), points)
+            self._save(part, points)
 
     def _elect(self, part: Part, rows: AnyArray) -> AnyArray:
         """Return one point per cell: the mean of its points, with the class with most votes, the

@@ -41,7 +41,10 @@ from carlasc.motion.tracks import MovingActors
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
+from carlasc.storage.derived_copies import check_complete
 from carlasc.storage.files import AnyPath, to_json, write_atomic, writing
+from carlasc.storage.folder import FolderWriter
+from carlasc.storage.inputs import MadeFrom, combined, sequence_states
 from carlasc.storage.protocol import Sequence, Source
 
 _LEAST_CELL_M = 0.001  # smaller cells are finer than float32 positions
@@ -118,6 +121,7 @@ def map(
             that does not fit.
         MissingDataError: there is no scan, no pose, no such grid, or nothing static.
         ConflictError: a file exists.
+        CompleteError: the files of this call exist.
         FormatError: a scan, poses or times are not valid.
         DependencyError: a file needs a package that is not installed, or poses have to be
             estimated, and kiss-icp is not installed.
@@ -132,10 +136,15 @@ def map(
     if run.part.count > 1:
         raise ArgumentError("part", expected="none, as a map is one file", found=str(run.part))
     files = MapFiles.of(out, mesh, distance, actors, grid)
+    opened, wanted = as_source(source), FrameRange.of(frames)
+    first, settings = files.all[0], (cell_m, str(wanted), grid, [str(path) for path in files.all])
+    states = sequence_states(opened, *([f"{grid}/labels", f"{grid}/counts"] if grid else []))
+    record = MadeFrom(combined(settings, motion, poses, sorted(states.items())))
+    keeper, kept = FolderWriter(first.parent), f"map-{first.name}"
+    if not overwrite and all(path.exists() for path in files.all):
+        check_complete(first, MadeFrom.read(keeper, kept) == record)
     files.check(overwrite)
-    opened, wanted, count, bodies, notes = (
-        as_source(source),
-        FrameRange.of(frames),
+    count, bodies, notes = (
         1,
         0,
         tuple[str, ...](),
@@ -150,6 +159,7 @@ def map(
             points, count, notes = drive.write(files), len(drive.frames), drive.notes()
             if files.actors is not None and files.out is not None:
                 bodies = drive.write_actors(files.actors, files.out.suffix.lower())
+    record.write(keeper, kept)
     return MapResult(
         tuple(str(path) for path in files.all),
         points,
@@ -285,6 +295,8 @@ class DriveMap:
     def notes(self) -> tuple[str, ...]:
         """Return remarks on the results, one line each."""
         where, notes, metadata = self.inputs.location, self.inputs.findings(), self.inputs.metadata
+        if self.inputs.feed.has_labels:
+            notes.append(f"{where}: classes {self.inputs.sequence.table_use()}")
         if not self.inputs.feed.has_labels:
             notes.append(
                 f"{where}: the scans have no labels: the map contains geometry only, in one class"

@@ -332,6 +332,8 @@ class FrameCounter:
         for name, members in self._members(seen):
             own = np.unique(seen.voxels[members])
             own = own[own >= 0]
+            if seen.known is not None:  # what is called unknown is not called free
+                own = own[seen.known.reshape(-1)[own]]
             if len(own) >= _MEMBERS:
                 add(sums, f"actor {name}", [0, 0, len(own), flat[own].sum(), 1])
         if (grid_T_world := self._grid_T_world(seen.number)) is not None:

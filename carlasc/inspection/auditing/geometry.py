@@ -29,6 +29,7 @@ _SAME = 0.25  # of the gain: corrections are not distinguished if their gains di
 _FLAT = 0.006  # values are equal if their shares differ by less
 # fact: belongs
 _BELONGS = 0.75  # with a smaller share of points, scans and grids do not belong together
+_DRIFT = "height drift"  # kind and name of its family
 
 
 @dataclass(frozen=True)
@@ -112,6 +113,14 @@ def judge_geometry(stretches: Stretches, one: MatchedGrids) -> Iterator[Verdict]
     if top < _BELONGS:
         return
     faults = [fit for fit in fits if fit.is_measured and fit.is_fault]
+    if one.of_these_poses:  # a drift of height is theirs
+        drifts = [fit for fit in faults if fit.family.kind == _DRIFT]
+        faults = [fit for fit in faults if fit.family.kind != _DRIFT]
+        fits = [fit for fit in fits if not drifts or fit.family.kind != _DRIFT]
+        for fit in drifts:
+            text = f"{_describe(fit, one)}: the poses of the recording drift, not the grids"
+            found = (fit.value, *fit.interval)
+            yield Verdict.of(one.path, _DRIFT, False, text, found, unit=fit.family.unit)
     if not faults:
         yield from (_sound_or_not(fit, one.path) for fit in fits)
         return
@@ -191,7 +200,7 @@ def _describe(fit: _Fit, one: MatchedGrids) -> str:
         return f"grids are moved by {value:.3f} m along {name[-1]}, {voxels:.2f} voxels {ends}"
     if fit.family.kind == "yaw":
         return f"grids are turned by {value:.2f} degrees {ends}"
-    if fit.family.kind == "height drift":
+    if fit.family.kind == _DRIFT:
         return f"height increases with the time of the scan, by {value:.2f} m/s {ends}"
     axes = (0, 1) if "x, y" in name else (2,) if " z" in name else (0, 1, 2)
     true = ", ".join(f"{one.spec.voxel_size[axis] / value:.3g}" for axis in axes)
@@ -270,8 +279,8 @@ def families(spec: GridSpec) -> list[Family]:
                 sizes = _family(name, kind, _RATIOS, scales, advice, "times", 0.02, 0.15)
                 sizes.warps[:, :, 3] = fixed - sizes.warps[:, :, :3] @ fixed
                 made.append(sizes)
-    advice, name = "refine the poses (`carlasc refine`) and make the grids again", "height drift"
-    drift = _family(name, name, _DRIFT_M_S, still, advice, "m/s", 0.02, 0.06)
+    advice = "refine the poses (`carlasc refine`) and make the grids again"
+    drift = _family(_DRIFT, _DRIFT, _DRIFT_M_S, still, advice, "m/s", 0.02, 0.06)
     drift.warps[:, 2, 4] = _DRIFT_M_S
     advice = "give the grids the numbers or the times of these scans"
     return [*made, drift, _family("lag", "lag", _LAGS, still, advice, "frames", 1.0, 1.0)]

@@ -31,13 +31,15 @@ from carlasc.core.tables import (
     remaps_between,
 )
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, count, first_names, reading
+from carlasc.groundtruth.from_scans.motion_pass import refine_sequence
+from carlasc.inspection.reports import inputs_of
 from carlasc.metrics.grids import SequenceGrid
 from carlasc.metrics.pairs import Place, open_grids
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import parse_json
 from carlasc.storage.layout import identity_of
 from carlasc.storage.protocol import Sequence
-from carlasc.storage.voxel_files import IGNORED_ID, GridFrames, VoxelFrames
+from carlasc.storage.voxel_files import GridFrames, VoxelFormat, VoxelFrames, is_counted
 
 _SAME_TIME_S = 0.06  # a grid belongs to a scan if their times differ by less; fact: same-time
 _HEIGHT_M = 1.8  # height of the sensor above the ground in CarlaSC, used if the recording has none
@@ -56,6 +58,7 @@ class MatchedGrids:
         absent: frames without a grid, within the span of the grids and at their usual interval.
         notes: what was assumed.
         height_m: height of the sensor above the origin of the grids.
+        of_these_poses: whether the grids were made with the poses of the recording.
     """
 
     grids: GridFrames
@@ -64,6 +67,7 @@ class MatchedGrids:
     absent: tuple[int, ...]
     notes: tuple[str, ...]
     height_m: float
+    of_these_poses: bool = False
 
     @property
     def path(self) -> str:
@@ -101,12 +105,12 @@ class MatchedGrids:
     @property
     def frame_name(self) -> str:
         """The frame of the grids in words."""
-        return f"{self._format_place}; {self.axes}-handed"
+        format, place = self._format, "the sensor, x forward"
+        return f"{place if format is None else format.place}; {self.axes}-handed"
 
     @property
-    def _format_place(self) -> str:
-        grids = self.grids
-        return grids.format.place if isinstance(grids, VoxelFrames) else "the sensor, x forward"
+    def _format(self) -> VoxelFormat | None:
+        return self.grids.format if isinstance(self.grids, VoxelFrames) else None
 
     @cached_property
     def grid_T_scan(self) -> Transform:
@@ -114,7 +118,7 @@ class MatchedGrids:
         matrix: Transform = np.diag(
             [1.0, 1.0 if self.axes == self.scans.metadata.axes else -1.0, 1.0, 1.0]
         )
-        if "y forward" in self._format_place:
+        if self._format is not None and self._format.y_forward:
             matrix = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ matrix
         matrix[2, 3] = self.height_m
         return matrix
@@ -170,8 +174,8 @@ class MatchedGrids:
             raise FormatError(where, expected=expected, found=str(labels.size), advice=advice)
         labels = labels.reshape(self.spec.size)
         occupied = labels != (0 if self.grids.classes is None else self.grids.classes.free)
-        if isinstance(self.grids, VoxelFrames):
-            occupied &= labels != IGNORED_ID
+        if isinstance(self.grids, VoxelFrames) and self.grids.classes is not None:
+            occupied &= is_counted(labels, self.grids.classes)
         if self._many_to_one:
             labels = CARLAOCC_TO_CARLA(labels, where)
         if known is not None:
@@ -260,7 +264,7 @@ def _recording_of(
 def _match_frames(grids: GridFrames, scans: Sequence, chosen: FrameRange) -> MatchedGrids:
     numbers, own, notes = grids.frames().tolist(), scans.frames("points").tolist(), list[str]()
     on_ground = grids.classes == OCC3D
-    height = _height_of(scans) if on_ground else 0.0
+    height = scans.metadata.height_m if on_ground else 0.0
     if height is None:
         height = _HEIGHT_M
         notes.append(f"the height of the sensor is not known: {height:g} m is assumed")
@@ -302,9 +306,30 @@ def _match_frames(grids: GridFrames, scans: Sequence, chosen: FrameRange) -> Mat
     made = [scan for _, scan in pairs]
     step = max(int(np.bincount(np.diff(made)).argmax()), 1) if len(made) > 1 else 1
     usual = [f for f in own if made[0] <= f <= made[-1] and (f - made[0]) % step == 0]
+    posed = _posed(grids, scans)
     return MatchedGrids(
-        grids, scans, tuple(pairs), tuple(sorted(set(usual) - set(made))), tuple(notes), height
+        grids,
+        posed or scans,
+        tuple(pairs),
+        tuple(sorted(set(usual) - set(made))),
+        tuple(notes),
+        height,
+        posed is not None,
     )
+
+
+def _posed(grids: GridFrames, scans: Sequence) -> Sequence | None:
+    """Return a recording under the poses with which the grids were made, by their record: given or
+    refined; None if they were not made from these scans.
+    """
+    if not isinstance(grids, SequenceGrid) or grids.sequence.location != scans.location:
+        return None
+    inputs = inputs_of(scans, grids.grid)
+    if inputs is None or layout.POSES not in scans.documents():
+        return None
+    if inputs.refines:
+        inputs.use_refined(refine_sequence(inputs.feed))
+    return inputs.feed.sequence
 
 
 def _token_times(grids: VoxelFrames) -> dict[str, float] | None:
@@ -312,7 +337,7 @@ def _token_times(grids: VoxelFrames) -> dict[str, float] | None:
     the scene or one above it.
     """
     folder = Path(grids.location)
-    for place in (folder, folder.parent, folder.parent.parent):
+    for place in (folder, *list(folder.parents)[:3]):
         if (file := place / _TIMES).is_file():
             with reading(file, "lines of a token and seconds"):
                 rows = [line.split() for line in file.read_text().splitlines() if line.strip()]
@@ -323,14 +348,6 @@ def _token_times(grids: VoxelFrames) -> dict[str, float] | None:
                 scene = scenes.get(folder.name, {})
                 return {token: float(entry["timestamp"]) / 1e6 for token, entry in scene.items()}
     return None
-
-
-def _height_of(scans: Sequence) -> float | None:
-    sensors = scans.metadata.extra.get("sensors")
-    first = sensors[0] if isinstance(sensors, list) and sensors else None
-    height: Any = first.get("height_m") if isinstance(first, dict) else None
-    is_number = isinstance(height, int | float) and not isinstance(height, bool)
-    return float(height) if is_number else None
 
 
 def _mapping(

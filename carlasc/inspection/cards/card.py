@@ -19,7 +19,6 @@ from carlasc.errors import (
 from carlasc.inspection.cards.card_tables import tables_of_card
 from carlasc.inspection.cards.croissant import croissant, vocabulary
 from carlasc.inspection.cards.facts import CardDetails, Facts, gather
-from carlasc.inspection.cards.licenses import license_given
 from carlasc.inspection.cards.places import place_of, tables_of
 from carlasc.inspection.cards.readme import readme
 from carlasc.inspection.texts import say
@@ -67,6 +66,7 @@ def card(
     *,
     about: CardDetails = CardDetails(),  # noqa: B008 (frozen)
     pictures: bool = True,
+    draft: bool = False,
     every: int = 1,
     overwrite: bool = False,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
@@ -83,6 +83,8 @@ def card(
             folder or a Parquet store; otherwise the folder that contains it.
         about: details that are not in the data: their name, authors, licence, and how to cite them.
         pictures: draw a grid and a scan (needs the extra `render`).
+        draft: write the card although licence, personal data, place or citation are not stated, and
+            name the gaps in it.
         every: count the classes of every N-th frame.
         overwrite: replace an existing card.
         run: how the counting is spread, with a callback for progress.
@@ -92,22 +94,24 @@ def card(
 
     Raises:
         MissingDataError: there is no data set, or it has no sequences.
-        ArgumentError: a licence, a version or a date is not valid; no licence is known; or the
-            licence contradicts that of the source.
+        ArgumentError: a licence, a version or a date is not valid; the licence contradicts that of
+            the source; or something that only the author can state is missing, and this is no
+            draft: the licence, and for data that do not say that they were simulated, personal
+            data, place and citation.
         FormatError: the data do not have the format, or the licence in carlasc.json is not known.
         CarlascError: the licence of the source forbids publishing derived data.
         ConflictError: a card exists, and `overwrite` is not given.
         StorageError: the folder cannot be written to.
     """
     check_types(card, locals())
-    stated = None if about.license is None else license_given(about.license)
     opened = as_source(source)
     place, folder = place_of(source, None if out is None else Path(out), about.url)
     overwrite = _check_free(folder, overwrite, pictures)
-    facts = gather(opened, stated, every, run)
+    facts = gather(opened, about, every, run, draft=draft)
     tables = tables_of(opened) if isinstance(opened, ParquetSource) else []
     shown = list(tables_of_card(facts))
-    made = say("simulated") if facts.simulated else ""
+    part = "" if facts.simulated == "all" else f"{facts.simulated} "
+    made = say("simulated", part=part) if facts.simulated else ""
     made += say("converted", sources=", ".join(facts.citations)) if facts.citations else ""
     frames, sequences = count(facts.frames, "LiDAR frame"), count(len(facts.sequences), "sequence")
     summary = say("summary", frames=frames, sequences=sequences, made=made)
@@ -119,6 +123,8 @@ def card(
     )
     write_output(folder / CROISSANT, croissant(facts, details, place, tables, shown))
     drawn, notes = _draw(facts, folder, overwrite) if pictures else ([], [])
+    if facts.gaps:
+        notes.append(say("draft", names=", ".join(facts.gaps)))
     if details.not_stated:
         notes.append(say("not_stated", names=", ".join(details.not_stated)))
     images = [(path.relative_to(folder).as_posix(), text) for path, text in drawn]

@@ -39,12 +39,12 @@ def croissant(
     shown: Sequence[Table],
 ) -> bytes:
     """Return the bytes of croissant.json, from the arguments of `readme`."""
-    licenses = [license_.url for license_ in facts.licenses]
+    licenses = [license_.url for license_ in facts.licenses if license_.url]
     version = f"{details.name}, version {details.version}, {details.published}"
     cited = ", ".join([*details.authors, version])
     stated: Json = {name: [text] for name, text in details.statements.items()}
     stated["dataLimitations"] = [*stated.get("dataLimitations", []), *facts.limits()]
-    stated["hasSyntheticData"] = facts.simulated or None
+    stated["hasSyntheticData"] = bool(facts.simulated) or None
     collected = details.statements.get("dataCollection")
     made = "; ".join(f"{grid.name}: {settings_of(grid)}" for grid, _, _ in facts.grids)
     content: Json = {
@@ -57,6 +57,8 @@ def croissant(
         "datePublished": details.published,
         "citeAs": details.citation or "; ".join(filter(None, facts.citations.values())) or cited,
         "url": details.url,
+        "spatialCoverage": details.place,
+        "creativeWorkStatus": "Draft" if facts.gaps else None,
         "creator": [{"@type": "sc:Organization", "name": name} for name in details.authors],
         **{f"rai:{name}": value for name, value in stated.items()},
         "prov:wasDerivedFrom": sorted(facts.citations),

@@ -5,14 +5,20 @@ from __future__ import annotations
 import datetime
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_types
 from carlasc.groundtruth.reporting import Report
-from carlasc.inspection.cards.licenses import License, LicensedPart, licensed_parts
+from carlasc.inspection.cards.licenses import (
+    UNSTATED,
+    License,
+    LicensedPart,
+    license_given,
+    licensed_parts,
+)
 from carlasc.inspection.overview import GridOverview, Overview, info
 from carlasc.inspection.reports import report_beside
 from carlasc.inspection.statistics import Statistics, stats
@@ -39,6 +45,7 @@ class CardDetails:
         license: licence of the sequences whose carlasc.json names none: a name such as cc-by-4.0,
             or the URL of its text. Converted sequences keep the licence of their source.
         citation: how to cite the data (BibTeX).
+        place: where the data were recorded, such as "Ann Arbor, Michigan, USA".
         statements: what only the author knows, such as personalSensitiveInformation: texts by the
             names of Croissant's RAI fields, of which `STATEMENTS` is the list.
         url: URL where the data are published, such as https://huggingface.co/datasets/ORG/NAME.
@@ -55,6 +62,7 @@ class CardDetails:
     authors: Sequence[str] = ()
     license: str | None = None
     citation: str | None = None
+    place: str | None = None
     statements: Mapping[str, str] = field(default_factory=dict)
     url: str | None = None
     contact: str | None = None
@@ -101,6 +109,7 @@ class Facts:
         statistics: the counts of classes, one for each class table; none without labels.
         every: every N-th frame was counted.
         reports: the reports beside the grids, by sequence and grid.
+        gaps: what only the author can state, and did not.
         lossy_mm: step to which coordinates of points were rounded, millimetres; None for exact
             ones.
     """
@@ -111,6 +120,7 @@ class Facts:
     statistics: tuple[Statistics, ...]
     every: int
     reports: Mapping[str, Report]
+    gaps: tuple[str, ...]
     lossy_mm: float | None
 
     @cached_property
@@ -158,9 +168,14 @@ class Facts:
         return [sequence.metadata for sequence in self.sequences.values()]
 
     @property
-    def simulated(self) -> bool:
-        """Whether the carlasc.json of a sequence says that it was recorded in a simulator."""
-        return bool(self.said("simulated"))
+    def simulated(self) -> str:
+        """The sequences that were recorded in a simulator, as their carlasc.json says: "all", "2 of
+        3 sequences", or "" for none.
+        """
+        number, count = len(_recorded(self.metadata)), len(self.sequences)
+        if number == count:
+            return ""
+        return f"{count - number} of {count} sequences" if number else "all"
 
     @property
     def failures(self) -> list[tuple[str, str]]:
@@ -195,12 +210,35 @@ class Facts:
             yield say("counted", every=self.every)
 
 
-def gather(source: Source, license_: License | None, every: int, run: Run) -> Facts:
+def _recorded(metadata: Iterable[Metadata]) -> list[Metadata]:
+    """Return those that do not say that their sequence was recorded in a simulator."""
+    return [about for about in metadata if about.extra.get("simulated") is not True]
+
+
+def _gaps(
+    sequences: Iterable[StoredSequence], parts: Iterable[LicensedPart], details: CardDetails
+) -> Iterator[str]:
+    """Yield the arguments that are missing. Simulated data show no people and no places."""
+    recorded = _recorded(one.metadata for one in sequences)
+    if unlicensed := [part.source for part in parts if part.license is UNSTATED]:
+        named = " and ".join(sorted(filter(None, unlicensed)))
+        yield f"license of {named}" if named else "license"
+    if recorded and "personalSensitiveInformation" not in details.statements:
+        yield "statements (personalSensitiveInformation)"
+    if recorded and not details.place:
+        yield "place"
+    cited = all(about.source and about.extra.get("citation") for about in recorded)
+    if not (cited or details.citation):
+        yield "citation"
+
+
+def gather(source: Source, details: CardDetails, every: int, run: Run, *, draft: bool) -> Facts:
     """Read the facts of a card.
 
     Raises:
         MissingDataError: the source has no sequences.
         FormatError: a sequence cannot be described.
+        ArgumentError: something that only the author can state is missing, and this is no draft.
         ArgumentError, FormatError, CarlascError: see `licensed_parts` and `stats`.
     """
     if every < 1:
@@ -209,7 +247,17 @@ def gather(source: Source, license_: License | None, every: int, run: Run) -> Fa
     if not sequences:
         advice = "make them with `carlasc regrid`"
         raise MissingDataError(source.location, expected="sequences", found="none", advice=advice)
-    parts = licensed_parts(sequences.values(), license_, source.location)
+    license_ = None if details.license is None else license_given(details.license)
+    parts = licensed_parts(sequences.values(), license_)
+    gaps = tuple(_gaps(sequences.values(), parts, details))
+    if gaps and not draft:
+        raise ArgumentError(
+            gaps[0].partition(" ")[0],
+            expected=f"{', '.join(gaps)} of {source.location}, which only the author can state",
+            found="none",
+            advice="state them, or mark the gaps with `draft=True`; carlasc.json of simulated data "
+            'has "simulated": true',
+        )
     overview = info(source)
     tables: dict[str, dict[str, StoredSequence]] = {}
     reports, counted = {}, []
@@ -228,4 +276,4 @@ def gather(source: Source, license_: License | None, every: int, run: Run) -> Fa
             one_table = ChosenSequences(source.location, chosen)
             counted.append(stats(one_table, remap=None, every=every, run=run))
     lossy_mm = source.lossy_mm if isinstance(source, PackedSource) else None
-    return Facts(overview, sequences, parts, tuple(counted), every, reports, lossy_mm)
+    return Facts(overview, sequences, parts, tuple(counted), every, reports, gaps, lossy_mm)

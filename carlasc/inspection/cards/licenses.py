@@ -56,6 +56,10 @@ class License:
         return (not self.derivatives, not self.commercial, self.share_alike is not False)
 
 
+UNSTATED = License("not stated", "", "unknown", None, None, None)
+"""The licence in a draft for which none is given."""
+
+
 @cache
 def _licenses() -> dict[str, License]:
     """Return the licences by name, with all versions of those of Creative Commons."""
@@ -134,7 +138,7 @@ class LicensedPart:
 
 
 def licensed_parts(
-    sequences: Iterable[Sequence], given: License | None, location: str
+    sequences: Iterable[Sequence], given: License | None
 ) -> tuple[LicensedPart, ...]:
     """Return the licences of a data set, the strictest first.
 
@@ -144,12 +148,10 @@ def licensed_parts(
     Args:
         sequences: the sequences.
         given: the licence that the author of the card names; None for none.
-        location: the data set, for errors.
 
     Raises:
         FormatError: the licence in carlasc.json is unknown.
-        ArgumentError: a sequence has no licence, and none is given; or one is given, although all
-            sequences have a licence.
+        ArgumentError: a licence is given, although all sequences have another one.
         CarlascError: a licence forbids publishing derived data.
     """
     paths_of: dict[tuple[str | None, License | None], list[str]] = {}
@@ -166,16 +168,9 @@ def licensed_parts(
         paths_of.setdefault((source, license_), []).append(sequence.path)
     parts = []
     for (source, license_), paths in paths_of.items():
-        holds = license_ or given
-        if holds is None:
-            without = sorted({source for source, license_ in paths_of if source and not license_})
-            raise ArgumentError(
-                "license",
-                expected=f"the licence of {' and '.join(without) or 'these data'}",
-                found=f"none given, and none in {layout.METADATA} of {location}",
-                advice="name it with `license`, such as cc-by-4.0",
-            )
-        parts.append(LicensedPart(source, holds, license_ is None, tuple(paths)))
+        parts.append(
+            LicensedPart(source, license_ or given or UNSTATED, license_ is None, tuple(paths))
+        )
     if given is not None and all(part.license != given for part in parts):
         names = sorted({part.license.name for part in parts})
         raise ArgumentError(

@@ -50,6 +50,7 @@ def readme(
         shown: the tables of the card.
         pictures: (path below the folder of the card, content) of each picture.
     """
+    draft = [f"**{say('draft', names=', '.join(facts.gaps))}**"] if facts.gaps else []
     drawn = [f"![{_text(caption)}]({path})" for path, caption in pictures]
     stated = [f"### {STATEMENTS[name]}\n\n{text}" for name, text in details.statements.items()]
     if details.not_stated:
@@ -58,7 +59,7 @@ def readme(
         "card.md",
         front_matter=_front_matter(facts, details, place, tables),
         name=_text(details.name or ""),
-        opening="\n\n".join([_text(details.description or ""), *drawn]),
+        opening="\n\n".join([*draft, _text(details.description or ""), *drawn]),
         glance=_glance(facts, details),
         reading=_opening(facts, place, tables),
         **{name: _section(shown, name) for name in ("classes", "sequences", "grids", "licenses")},
@@ -76,7 +77,7 @@ def _front_matter(
     if others := [license_ for license_ in facts.licenses if license_.hub == "other"]:
         values["license_name"] = re.sub(r"[^a-z0-9.]+", "-", others[0].name.lower()).strip("-")
         values["license_link"] = others[0].url
-    tags = {"scene-flow": "flow" in facts.fields, "simulation": facts.simulated}
+    tags = {"scene-flow": "flow" in facts.fields, "simulation": bool(facts.simulated)}
     values |= {
         "pretty_name": details.name,
         "task_categories": ["other"],
@@ -114,7 +115,8 @@ def _glance(facts: Facts, details: CardDetails) -> str:
         "axes": " and ".join(sorted({one.axes for one in sequences})) + "-handed",
         "poses": facts.said("poses"),
         "labels": facts.said("labels"),
-        "simulated": "yes" if facts.simulated else "",
+        "simulated": facts.simulated,
+        "place": details.place,
         "licence": ", ".join(license_.name for license_ in facts.licenses),
         "version": f"{details.version}, {details.published}",
         "authors": ", ".join(details.authors),

@@ -153,12 +153,12 @@ class RerunWriter:
         classes = [(0, "unlabelled", palette.UNLABELLED)]
         classes += [(entry.order, entry.name, entry.color) for entry in entries]
         log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, rr.AnnotationContext(classes))
-        car = ego_vehicle()
-        corners, triangles = car.triangles()
-        surface = Triangles(corners, np.repeat(car.normals, 4, axis=0), triangles.astype(np.uint32))
-        log(
-            "world/ego/vehicle", self._mesh(surface, vertex_colors=np.repeat(car.colors, 4, axis=0))
-        )
+        if reader.shows_ego:
+            car = ego_vehicle()
+            corners, faces = car.triangles()
+            surface = Triangles(corners, np.repeat(car.normals, 4, axis=0), faces.astype(np.uint32))
+            paint = np.repeat(car.colors, 4, axis=0)
+            log("world/ego/vehicle", self._mesh(surface, vertex_colors=paint))
         path = reader.path_of_ego()
         if len(path) > 1:
             log(

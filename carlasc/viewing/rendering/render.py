@@ -168,7 +168,10 @@ def render(
         if boxes:
             check_boxes(reader.data)
 
-    renderers = [FrameRenderer(reader, camera, style.ego, color, boxes) for reader in readers]
+    renderers = [
+        FrameRenderer(reader, camera, style.ego and reader.shows_ego, color, boxes)
+        for reader in readers
+    ]
     pictures = plan_cells(renderers, film)
     shown = [cell for cells in pictures for cell in cells]
     entries = merge_legends(c.renderer.legend_of(c.frame) for c in shown if style.legend)

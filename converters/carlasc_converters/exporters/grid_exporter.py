@@ -227,16 +227,15 @@ def sensor_height(sequence: storage.Sequence, given: float | None) -> tuple[floa
     """Return the height of the sensor above the ground in metres, and whether it was assumed.
 
     It is the given height, that of the first sensor in carlasc.json, or that of CarlaSC. Sequences
-    without carlasc.json are CarlaSC's.
+    without carlasc.json are CarlaSC's, and captures that CarlaSC's simulators recorded are alike.
     """
-    if given is not None:
-        return given, False
-    sensors = sequence.metadata.extra.get("sensors")
-    first = sensors[0] if isinstance(sensors, list) and sensors else None
-    height = first.get("height_m") if isinstance(first, dict) else None
-    if isinstance(height, int | float) and not isinstance(height, bool):
-        return float(height), False
-    return _CARLASC_HEIGHT_M, storage.layout.METADATA in sequence.documents()
+    metadata = sequence.metadata
+    height = metadata.height_m if given is None else given
+    if height is not None:
+        return height, False
+    simulated = metadata.extra.get("simulated") is True and "sensors" not in metadata.extra
+    is_own = simulated or storage.layout.METADATA not in sequence.documents()
+    return _CARLASC_HEIGHT_M, not is_own
 
 
 def read_points(sequence: storage.Sequence, frame: int) -> Float32Array:

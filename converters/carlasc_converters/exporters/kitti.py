@@ -16,12 +16,13 @@ from carlasc.core.arrays import (
     AnyFloatArray,
     AnyIntArray,
     Float32Array,
+    FloatArray,
     Int32Array,
     LabelArray,
     Uint32Array,
 )
 from carlasc.core.classes import ClassTable
-from carlasc.core.geometry import mirror_poses
+from carlasc.core.geometry import invert, mirror_poses, multiply
 from carlasc.core.grids import mirror_grid, mirror_spec
 from carlasc.core.tables import CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_choice
@@ -41,7 +42,7 @@ from carlasc_converters.exporters.submission import (
     pack_submission,
 )
 from carlasc_converters.kitti import CLASS_PARTS
-from carlasc_converters.kitti_voxels import MASKS, pack_bits
+from carlasc_converters.kitti_voxels import GRID, MASKS, pack_bits
 
 _NAMES_OF_11 = (
     "unlabeled building fence other-object person pole road other-ground sidewalk vegetation car"
@@ -84,10 +85,7 @@ _STANDS, _MOVES = (
 _MOVING_M_S = 0.5  # points that are faster than this are moving
 _TO_MOVING = np.arange(max(SEMANTICKITTI.names) + 1)
 _TO_MOVING[list(SEMANTICKITTI.standing.values())] = list(SEMANTICKITTI.standing)
-_CALIBRATION = "".join(
-    f"{name}: {' '.join(f'{value:.12e}' for value in np.eye(4)[:3].ravel())}\n"
-    for name in ("P0", "P1", "P2", "P3", "Tr")
-)
+_PROJECTIONS = ("P0", "P1", "P2", "P3")
 
 
 class KittiExporter(FrameExporter):
@@ -172,6 +170,12 @@ class KittiExporter(FrameExporter):
         if sequence.grids or self.grid or self.predictions:
             name = self._grid_of(sequence)
             self._mapping(sequence.classes_of(name), f"{sequence.location}/{name}")
+            spec = sequence.grids[name]
+            if spec.size != GRID.size:
+                return [
+                    f"{sequence.location}/{name} is {spec}; programs for SemanticKITTI read only "
+                    f"voxels of {GRID}"
+                ]
         return []
 
     def frames(self, sequence: storage.Sequence) -> list[int]:
@@ -183,16 +187,22 @@ class KittiExporter(FrameExporter):
     def documents(self, sequence: storage.Sequence) -> dict[str, bytes]:
         """Return poses, calibration and times.
 
-        The poses are those of the LiDAR, and Tr is the identity.
+        With KITTI's cameras, poses are those of the left one, as in KITTI. Without, they are those
+        of the LiDAR, and Tr is the identity.
         """
         if self.predictions:
             return {}
         documents = {}
         if layout.POSES in sequence.documents():
-            documents["poses.txt"] = layout.encode_poses(
-                sequence.poses if _is_right_handed(sequence) else mirror_poses(sequence.poses)
-            )
-            documents["calib.txt"] = _CALIBRATION.encode()
+            poses = sequence.poses if _is_right_handed(sequence) else mirror_poses(sequence.poses)
+            calibration = _calibration(sequence)
+            if "image_0" in storage.cameras_of(sequence):
+                poses = multiply(calibration["Tr"], poses, invert(calibration["Tr"]))
+            documents["poses.txt"] = layout.encode_poses(poses)
+            documents["calib.txt"] = "".join(
+                f"{name}: {' '.join(f'{value:.12e}' for value in matrix[:3].ravel())}\n"
+                for name, matrix in calibration.items()
+            ).encode()
         if layout.TIMES in sequence.documents():
             documents["times.txt"] = layout.encode_times(sequence.times)
         return documents
@@ -361,6 +371,25 @@ def _kept_files(sequence: storage.Sequence, frame: int) -> dict[str, bytes]:
         except (MissingDataError, FileNotFoundError):
             continue
     return kept
+
+
+def _calibration(sequence: storage.Sequence) -> dict[str, FloatArray]:
+    """Return the projections P0 to P3 and Tr, from the LiDAR to the left camera, of the rectified
+    cameras image_0 to image_3; identities without them.
+    """
+    cameras = storage.cameras_of(sequence)
+    left = cameras.get("image_0")
+    lidar_T_scan = np.diag([1.0, 1.0 if _is_right_handed(sequence) else -1.0, 1.0, 1.0])
+    camera_T_lidar = np.eye(4)
+    if left is not None:
+        camera_T_lidar = invert(lidar_T_scan @ left.sensor_T_camera)
+    made: dict[str, FloatArray] = {}
+    for number, name in enumerate(_PROJECTIONS):
+        camera, made[name] = cameras.get(f"image_{number}"), np.eye(4)
+        if camera is not None and left is not None:
+            left_T_camera = camera_T_lidar @ lidar_T_scan @ camera.sensor_T_camera
+            made[name] = camera.matrix @ invert(left_T_camera)[:3]
+    return {**made, "Tr": camera_T_lidar}
 
 
 def _is_right_handed(sequence: storage.Sequence) -> bool:

@@ -78,11 +78,11 @@ def write_scene(
 
 
 def files_and_bytes(root: Path) -> dict[str, bytes]:
-    """Return every file below a folder, by its path."""
+    """Return every file below a folder, by its path, without the records of inputs."""
     return {
         path.relative_to(root).as_posix(): path.read_bytes()
         for path in sorted(root.rglob("*"))
-        if path.is_file()
+        if path.is_file() and not path.match("carlasc-*-of-*.json")
     }
 
 

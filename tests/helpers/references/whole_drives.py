@@ -107,5 +107,9 @@ def find_actors(
         deformable=deformable, first_instance=first_instance, default_label=default_label
     )
     ended = [follower.add(evidence) for evidence in find_evidence(scans, movable=movable)]
-    tracked = chain.from_iterable([*ended, follower.finish()])
+    tracked = [
+        actor
+        for actor in chain.from_iterable([*ended, follower.finish()])
+        if actor.segments[0].instance not in follower.riders
+    ]
     return FoundActors(follower.moved, tuple(tracked), tuple(follower.own))

@@ -118,6 +118,7 @@ def test_the_card_of_a_data_set_of_the_hub_is_written_here(server: Hub, tmp_path
             str(tmp_path / "card"),
             "--license",
             "mit",
+            "--draft",
             "--no-pictures",
             "--published",
             "2026-11-22",

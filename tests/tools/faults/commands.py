@@ -150,6 +150,11 @@ _ALL = (
     ),
     Command("unpack", "unpack scene.zarr out", ("scene.zarr",), "out", _ZARR),
     Command("export-kitti", "export kitti scene out", ("scene",), "out"),
+    Command("convert-scans", f"convert scans scans out {GRID} --force", ("scans",), "out"),
+    Command("label", "label scene -o out --from labels", ("scene", "labels"), "out"),
+    Command("label-motion", "label scene -o out --from motion", ("scene",), "out"),
+    Command("refine", "refine scene -o out --refine always", ("scene",), "out"),
+    Command("map", "map scene out.ply", ("scene",), "out.ply"),
     Command(
         "render-picture", f"render scene -o out.png {PICTURE}", ("scene",), "out.png", _PICTURES
     ),
@@ -232,7 +237,15 @@ def build_inputs(base: Path, commands: Iterable[Command] | None = None) -> None:
     wanted = {name for command in (commands or COMMANDS.values()) for name in command.inputs}
     if "kitti" in wanted:
         write_tiny_kitti(base / "kitti", frames=2, voxels=True)
-    for name in wanted - {"kitti"}:
+    if "scans" in wanted:
+        from faults.foreign import DATA_SETS
+
+        DATA_SETS["scans"](base / "scans")
+    if "labels" in wanted:
+        _make("scene", base)
+        (labels,) = (base / "scene").rglob("labels")
+        shutil.copytree(labels, base / "labels")
+    for name in wanted - {"kitti", "scans", "labels"}:
         _make(name, base)
 
 

@@ -11,6 +11,7 @@ import carlasc
 from carlasc.errors import CarlascError
 from faults.commands import MESSAGES, TEMPORARY
 
+RECORDS = ".carlasc"  # folder
 STORES = (".zarr", ".h5", ".parquet")
 Content = dict[str, bytes | None]
 """Every path below a folder, and the bytes of each file; None for a folder or a link."""
@@ -18,14 +19,22 @@ Content = dict[str, bytes | None]
 
 def content_of(folder: Path) -> Content:
     """Return what is in a folder, without the messages of commands, and without the file by which
-    Python tries the folder for temporary files.
+    Python tries the folder for temporary files. Records of inputs are listed without their bytes,
+    which have the times of files.
     """
     found: Content = {}
     for path in sorted(folder.rglob("*")):
         if path.name != MESSAGES and not _is_trial(path):
-            is_file = path.is_file() and not path.is_symlink()
+            is_file = path.is_file() and not path.is_symlink() and not is_record(path)
             found[path.relative_to(folder).as_posix()] = path.read_bytes() if is_file else None
     return found
+
+
+def is_record(path: Path) -> bool:
+    """Whether a file is a record of inputs."""
+    return path.suffix == ".json" and (
+        path.parent.name == RECORDS or path.match("carlasc-*-of-*.json")
+    )
 
 
 def _is_trial(path: Path) -> bool:

@@ -62,6 +62,15 @@ KINDS = {
         500,
         100_000,
     ),
+    "changes": Kind(
+        "faults.changes",
+        "changed inputs",
+        "An input of a finished command changes (values, length, removed, text, time only), and the "
+        "command runs again: the result is that of a run into an empty folder, or the run is "
+        "refused",
+        200,
+        5_000,
+    ),
     "mutations": Kind(
         "faults.mutations",
         "damaged files",

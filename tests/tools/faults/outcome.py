@@ -10,7 +10,7 @@ class Outcome:
     """The result of trying many faults of one kind.
 
     Attributes:
-        kind: which faults: kills, calls, crashes, mutations, hostile.
+        kind: which faults: kills, calls, crashes, changes, mutations, hostile.
         tried: number of cases that were really run.
         found: one line per case that failed, with what repeats it (command, seed, number).
         seconds: how long it took.

@@ -21,6 +21,7 @@ import numpy as np
 from helpers.datasets.tiny_kitti import write_tiny_kitti
 
 from faults.commands import run_here
+from faults.comparing import is_record
 
 DATA = Path(__file__).parents[2] / "data"
 SUMS = DATA / "sums.json"
@@ -65,11 +66,11 @@ def write_inputs(folder: Path) -> None:
 
 
 def sums_in(folder: Path) -> dict[str, str]:
-    """Return the sum of every file in a folder, by its path."""
+    """Return the sum of every file in a folder but records of inputs, by its path."""
     return {
         path.relative_to(folder).as_posix(): hashlib.sha256(_of_no_version(path)).hexdigest()
         for path in sorted(folder.rglob("*"))
-        if path.is_file()
+        if path.is_file() and not is_record(path)
     }
 
 

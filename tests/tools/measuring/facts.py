@@ -38,7 +38,12 @@ CONSTANTS: dict[str, dict[str, str]] = {
         "30%": "explained[1]",
     },
     "docs/commands/capture.md": {"0.1 s": "frame-period"},
-    "docs/commands/convert.md": {"5%": "below-grid"},
+    "docs/commands/convert.md": {
+        "5%": "below-grid",
+        "3 s": "longest-frame",
+        "0.25 s": "pose-reach",
+        "1 s": "pose-gap",
+    },
     "docs/commands/demo.md": {"240 MB": "demo-size"},
     "docs/commands/evaluate.md": {
         "0.05 s": "forecast-time",
@@ -46,7 +51,8 @@ CONSTANTS: dict[str, dict[str, str]] = {
     },
     "docs/commands/regrid.md": {"2 GB": "large-frame[1]"},
     "docs/commands/validate.md": {
-        "0.02 s": "relevant-mounting[6]",
+        "0.1%": "far-points[1]",
+        "10%": "empty-grids",
     },
     "docs/commands/view.md": {
         "10 frames per second": "film-rate",
@@ -89,7 +95,6 @@ CONSTANTS: dict[str, dict[str, str]] = {
     "docs/sets/scans.md": {
         "4 ms": "scan-duration",
         "0.6 s": "scan-duration[1]",
-        "3 s": "longest-scan",
         "0.1 s": "frame-period",
     },
     "docs/sets/semanticposs.md": {"0.1 s": "frame-period"},
