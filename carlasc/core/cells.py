@@ -182,28 +182,6 @@ def numbered(cells: IntArray) -> tuple[IntArray, IntArray]:
     return first[:count], number
 
 
-def voxels_of(points: AnyFloatArray, grid_T_points: Transform, spec: GridSpec) -> Int32Array:
-    """Return the (N,) flat indices of the voxels of points; the number of voxels for points outside
-    of the grid.
-
-    Args:
-        points: (N, 3) metres.
-        grid_T_points: (4, 4), from the frame of the points to the frame of the grid.
-        spec: geometry of the grid.
-    """
-    voxels = np.empty(len(points), np.int32)
-    _place(np.ascontiguousarray(points), as_pose(grid_T_points), Cells.of(spec), voxels)
-    return voxels
-
-
-@cached
-def _place(points: AnyFloatArray, pose: Pose, cells: Cells, voxels: Int32Array) -> None:
-    for i in range(len(points)):
-        point = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        x, y, z = transform(pose, point[0], point[1], point[2])
-        voxels[i] = find_voxel(x, y, z, cells)
-
-
 def count_points(
     points: AnyFloatArray,
     grid_T_points: Transform,

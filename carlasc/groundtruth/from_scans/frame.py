@@ -27,7 +27,7 @@ from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.free_space import FreeSpace
 from carlasc.groundtruth.from_scans.merging import STATIC, BodyRegions, Instant, Merger
 from carlasc.groundtruth.inputs import FrameData, GridPlan
-from carlasc.groundtruth.voting.ballot import Ballot, Observation, Votes
+from carlasc.groundtruth.voting.ballot import EVERYWHERE, Ballot, Observation, SeenClass, Votes
 from carlasc.groundtruth.voting.certainty import (
     UNKNOWN,
     ClassConsensus,
@@ -86,8 +86,9 @@ def merge_frame(
     own_free, seen_now = own.free[steps.in_body], own.seen()
     del own  # frees memory for the next ballots
     # The static scene votes in all voxels, and each moving actor in the voxels of its body.
-    points = merger.observations(now, window), merger.in_bodies(now, window, regions, plan.spec)
-    ballot = steps.vote(chain(*points))
+    ballot = steps.vote(
+        points=chain(merger.points(now, window), merger.in_bodies(now, window, regions))
+    )
     ballot.free[:] = space.of_scene(merger, now, window)
     ballot.free[steps.in_body] = own_free
     space.in_bodies(merger, now, window, regions, ballot.free)
@@ -112,12 +113,12 @@ def merge_frame(
     # Actors are completed by their mirror images, then by the surfaces of their tracks.
     completed = list[tuple[IntArray, AnyArray]]()
     if regions.actors and options.complete != "seen":
-        mirrored = steps.vote(merger.in_bodies(now, window, regions, plan.spec, mirror=True))
+        mirrored = steps.vote(points=merger.in_bodies(now, window, regions, mirror=True))
         space.in_bodies(merger, now, window, regions, mirrored.free, mirror=True)
         completed.append(steps.complete(made, mirrored.votes(copy=False)))
         if options.complete == "body":
             del mirrored
-            shells = steps.vote(merger.shells(now, regions, plan.spec))
+            shells = steps.vote(points=merger.shells(now, regions))
             completed.append(steps.complete(made, shells.votes(copy=False)))
 
     # After completion: an inferred body must not stand where the recording vehicle drove.
@@ -330,8 +331,10 @@ class _FrameSteps:
             flags[where] |= np.uint8(flag)
         return flags
 
-    def vote(self, observations: Iterable[Observation]) -> Ballot:
-        """Return the votes of observations."""
+    def vote(
+        self, observations: Iterable[Observation] = (), points: Iterable[SeenClass] = ()
+    ) -> Ballot:
+        """Return the votes of observations, and of points without rays."""
         ballot = Ballot(
             self.plan.spec,
             self.feed.classes,
@@ -341,6 +344,7 @@ class _FrameSteps:
         )
         for observation in observations:
             ballot.add(observation)
+        ballot.add_points(points)
         return ballot
 
     def _evidence(
@@ -375,7 +379,9 @@ class _FrameSteps:
         if self.feed.options.dynamic != "align":
             return _NO_VOXELS
         others = [other for other in self.window if other != self.now.frame]
-        return np.flatnonzero(self.vote(self.merger.moving(self.now, others)).hit & ~self.in_body)
+        passing = list(self.merger.moving(self.now, others))
+        moving = self.vote(points=[(self.feed.classes.geometry_id, passing, *EVERYWHERE)])
+        return np.flatnonzero(moving.hit & ~self.in_body)
 
     def keep_returns(self, made: _UnfinishedGrid, votes: Votes, consensus: ClassConsensus) -> None:
         """Make voxels with returns of the frame's own scan occupied, unless the returns are

@@ -8,6 +8,7 @@ Free space of the static scene from other scans does not count there.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, replace
@@ -18,7 +19,6 @@ import numpy as np
 
 from carlasc.core.arrays import (
     AnyFloatArray,
-    AnyIntArray,
     BoolArray,
     Float32Array,
     FloatArray,
@@ -27,13 +27,12 @@ from carlasc.core.arrays import (
     LabelArray,
     Uint16Array,
 )
-from carlasc.core.cells import voxels_of
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import RaysFromPlace, lengths, runs_of_origins
 from carlasc.groundtruth.options import Dynamic
-from carlasc.groundtruth.voting.ballot import Observation
+from carlasc.groundtruth.voting.ballot import EVERYWHERE, ClassPoints, Observation, SeenClass
 from carlasc.groundtruth.voting.free_maps import Cast
 from carlasc.motion import BODY_MARGIN_M
 from carlasc.motion.tracks import MovingActors, Track
@@ -46,7 +45,7 @@ _RECENT_S = 0.25  # scans within this time before and after a frame show the sce
 # Points so near to the body of an actor may belong to it, as paths have errors: metres along,
 # across and up.
 _AROUND_M = np.array([0.3, 0.3, 0.1])
-MIRROR, _MIRRORED = np.diag([1.0, -1.0, 1.0, 1.0]), np.array([1, -1, 1], np.float32)
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -211,7 +210,7 @@ class _Carried:
 
     Attributes:
         cast: the rays through the body.
-        points: (M, 3) float32, metres, the points of the actor.
+        points: (3, M) float32, metres, the points of the actor.
     """
 
     cast: Cast
@@ -239,31 +238,29 @@ class Merger:
         self._static: dict[int, BoolArray] = {}
         self._labels: dict[int, Uint16Array] = {}
         self._carried: dict[tuple[int, int], _Carried | None] = {}
-        self._points: dict[int, tuple[Float32Array, Uint16Array, Float32Array | None]] = {}
-        self._moving: dict[int, tuple[Float32Array, Uint16Array]] = {}
+        self._points: dict[tuple[int, bool], dict[int, ClassPoints]] = {}
+        self._moving: dict[int, Float32Array] = {}
 
     def forget_before(self, frame: int) -> None:
         """Clear the caches of scans before a frame."""
-        for kept in (self._static, self._labels, self._moving, self._points):
+        for kept in (self._static, self._labels, self._moving):
             for other in [key for key in kept if key < frame]:
                 del kept[other]
+        self._points = {key: value for key, value in self._points.items() if key[0] >= frame}
         self._carried = {key: value for key, value in self._carried.items() if key[1] >= frame}
 
     def own(self, now: Instant) -> Observation:
         """Return the observation by the frame's own scan, whose rays count everywhere."""
         scan = self.scan_of(now.frame)
-        hits = None
-        if self.dynamic == "drop":
-            hits = self.static(now.frame)
-        elif self.actors.own:  # points on the recording vehicle do not vote
-            hits = ~self.actors.is_own(scan.points)
-        places = now.grid_T_world @ scan.world_T_places
         return Observation(
-            labels=self.labels(now.frame), grid_T_sensor=places, hits=hits, **scan.from_places()
+            labels=self.labels(now.frame),
+            grid_T_sensor=now.grid_T_world @ scan.world_T_places,
+            hits=self._votes(now.frame, own=True),
+            **scan.from_places(),
         )
 
-    def observations(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
-        """Yield the static points of each scan, and all points of the frame's own scan.
+    def points(self, now: Instant, window: Iterable[int]) -> Iterator[SeenClass]:
+        """Yield the static points of each scan, and all points of the frame's own scan, by class.
 
         Static surfaces vote everywhere, so the road below an actor is kept.
 
@@ -271,39 +268,42 @@ class Merger:
             now: the frame.
             window: frames of the scans.
         """
+        found = defaultdict[int, list[ClassPoints]](list)
         for other in window:
-            if other == now.frame:
-                yield replace(self.own(now), rays=False)
-                continue
-            scan = self.scan_of(other)
-            if other not in self._points:
-                voting = np.flatnonzero(
-                    ~self.actors.is_own(scan.points)
-                    if self.dynamic == "tube"
-                    else self.static(other)
-                )
-                sure = None if scan.sure is None else scan.sure[voting]
-                self._points[other] = scan.points[voting], self.labels(other)[voting], sure
-            points, labels, sure = self._points[other]
-            pose = now.grid_T_world @ scan.world_T_sensor
-            yield Observation(points, labels, pose, sure=sure, rays=False)
+            key = other, other == now.frame
+            if key not in self._points:
+                self._points[key] = dict(self._by_class(*key))
+            pose = now.grid_T_world @ self.scan_of(other).world_T_sensor
+            for label, seen in self._points[key].items():
+                found[label].append(seen._replace(grid_T_points=pose))
+        for label, points in found.items():
+            yield label, points, *EVERYWHERE
+
+    def _votes(self, frame: int, own: bool) -> BoolArray:
+        """Return (N,) bool: the points of a scan that vote in its own frame, or in others."""
+        if self.dynamic == "tube" or (own and self.dynamic != "drop"):
+            return ~self.actors.is_own(self.scan_of(frame).points)
+        return self.static(frame)
+
+    def _by_class(self, frame: int, own: bool) -> Iterator[tuple[int, ClassPoints]]:
+        scan = self.scan_of(frame)
+        labels = np.where(self._votes(frame, own), self.labels(frame), np.uint16(0))
+        for label in np.flatnonzero(np.bincount(labels)).tolist():
+            rows = np.flatnonzero(labels == label) if label else ()
+            if len(rows):
+                points = np.ascontiguousarray(scan.points[rows].T)
+                sure = None if scan.sure is None else scan.sure[rows]
+                yield label, ClassPoints(points, scan.world_T_sensor, sure)
 
     def in_bodies(
-        self,
-        now: Instant,
-        window: Iterable[int],
-        regions: BodyRegions,
-        spec: GridSpec,
-        *,
-        mirror: bool = False,
-    ) -> Iterator[Observation]:
-        """Yield the points of each actor in the voxels of its body, by other scans.
+        self, now: Instant, window: Iterable[int], regions: BodyRegions, *, mirror: bool = False
+    ) -> Iterator[SeenClass]:
+        """Yield the points of each actor in other scans, in the voxels of its body.
 
         Args:
             now: the frame.
             window: frames of the scans.
             regions: the voxels of the bodies.
-            spec: the grid.
             mirror: yield mirror images instead. Vehicles are symmetric: their points are reflected
                 in the vertical plane through the middle of the body, if that is known. Only mirror
                 images use the frame's own scan.
@@ -311,21 +311,10 @@ class Merger:
         for region, number in regions.actors.items():
             track, seen = self.actors.tracks[number], self.seen(number, now, window, mirror)
             pose = track.pose(now.frame)
-            if not seen or pose is None:
-                continue
-            points = np.concatenate([carried.points for carried in seen.values()])
-            ends = np.cumsum([len(carried.points) for carried in seen.values()])
-            grid_T_actor = now.grid_T_world @ pose
-            points = points * _MIRRORED if mirror else points
-            voxels = voxels_of(points, grid_T_actor, spec)
-            yield Observation(
-                points,
-                np.full(len(points), track.label, np.uint16),
-                np.repeat(grid_T_actor[None], len(ends), axis=0),
-                hits=regions.contain(region, voxels),
-                ends=ends,
-                rays=False,
-            )
+            if pose is not None:
+                grid_T_points = now.grid_T_world @ pose @ (MIRROR if mirror else np.eye(4))
+                points = [ClassPoints(one.points, grid_T_points) for one in seen.values()]
+                yield track.label, points, regions.of_voxel, region
 
     def seen(
         self, number: int, now: Instant, window: Iterable[int], mirror: bool
@@ -344,25 +333,14 @@ class Merger:
                     found[other] = carried
         return found
 
-    def moving(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
-        """Yield the moving points of scans, at their positions in these scans."""
-        seen = list[tuple[Float32Array, Uint16Array, Transform]]()
+    def moving(self, now: Instant, window: Iterable[int]) -> Iterator[ClassPoints]:
+        """Yield the moving points of scans, of all classes, at their positions in these scans."""
         for other in window:
             scan = self.scan_of(other)
             if other not in self._moving:
-                moving = np.flatnonzero(~self.static(other))
-                self._moving[other] = scan.points[moving], self.labels(other)[moving]
-            seen.append((*self._moving[other], now.grid_T_world @ scan.world_T_sensor))
-        if seen:
-            points, labels, poses = zip(*seen, strict=True)
-            ends = np.cumsum([len(own) for own in points])
-            yield Observation(
-                np.concatenate(points),
-                np.concatenate(labels),
-                np.stack(poses),
-                ends=ends,
-                rays=False,
-            )
+                moving = scan.points[~self.static(other)]
+                self._moving[other] = np.ascontiguousarray(moving.T)
+            yield ClassPoints(self._moving[other], now.grid_T_world @ scan.world_T_sensor)
 
     def recent(self, now: Instant, window: Iterable[int]) -> list[int]:
         """Return the frames of the scans within `_RECENT_S` of the frame."""
@@ -370,17 +348,15 @@ class Merger:
             other for other in window if abs(self.scan_of(other).seconds - now.seconds) <= _RECENT_S
         ]
 
-    def shells(self, now: Instant, regions: BodyRegions, spec: GridSpec) -> Iterator[Observation]:
+    def shells(self, now: Instant, regions: BodyRegions) -> Iterator[SeenClass]:
         """Yield the surface of each vehicle in its body, for the parts that no scan saw."""
         for region, number in regions.actors.items():
             track = self.actors.tracks[number]
             pose = track.pose(now.frame)
-            points = track.surface
-            if len(points) and pose is not None:
-                grid_T_actor = now.grid_T_world @ pose
-                own = regions.contain(region, voxels_of(points, grid_T_actor, spec))
-                labels = np.full(len(points), track.label, np.uint16)
-                yield Observation(points, labels, grid_T_actor, hits=own, rays=False)
+            if len(track.surface) and pose is not None:
+                surface = np.ascontiguousarray(track.surface.T)
+                points = [ClassPoints(surface, now.grid_T_world @ pose)]
+                yield track.label, points, regions.of_voxel, region
 
     def static(self, frame: int) -> BoolArray:
         """Return (N,) bool: the points of a scan that belong to no moving actor.
@@ -438,7 +414,8 @@ class Merger:
             if rays:
                 ends = np.cumsum([len(points) for points in rays])
                 cast = Cast(np.concatenate(rays), ends, np.stack(places), track.lower, track.upper)
-                self._carried[key] = _Carried(cast, np.concatenate(hits))
+                points = np.ascontiguousarray(np.concatenate(hits).T)
+                self._carried[key] = _Carried(cast, points)
         return self._carried.setdefault(key, None)
 
 
@@ -500,13 +477,6 @@ class BodyRegions:
                 spec, transform_points(now.grid_T_world @ scan.world_T_sensor, moving)
             )
         return regions
-
-    def contain(self, region: int, voxels: AnyIntArray) -> BoolArray:
-        """Return (N,) bool: which voxels, flat indices, belong to a region; those outside of the
-        grid do not.
-        """
-        own = self.of_voxel.take(voxels, mode="clip") == region
-        return own & (voxels < len(self.of_voxel))
 
     def with_points(self, spec: GridSpec, points: AnyFloatArray) -> BodyRegions:
         """Return the regions with another one for the voxels of moving points without a body.

@@ -9,9 +9,9 @@ and a voxel without votes is unknown: see the format page, `docs/format.md#votes
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import get_args
+from typing import TYPE_CHECKING, NamedTuple, get_args
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from carlasc.core.arrays import (
     IntArray,
     LabelArray,
     Uint8Array,
+    Uint16Array,
 )
 from carlasc.core.choices import VoteRule as VoteRule  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable
@@ -30,6 +31,9 @@ from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.storage.field_files import VOTES_DTYPE, WIDE_VOTES_DTYPE
+
+if TYPE_CHECKING:
+    from carlasc.core.cells import Pose
 
 _MOST_VOTES = int(np.iinfo(VOTES_DTYPE["votes"]).max)
 OCCUPIED_DTYPE = np.dtype(
@@ -61,7 +65,6 @@ class Observation:
             None: all points.
         sure: (N,) float32, probability of the class of each point; None: 1.
         ends: (K,) int64, index after the last point of each voter; None: one voter.
-        rays: whether the rays vote for free space.
 
     Raises:
         FormatError: points and labels differ in length, have another shape or type, or the
@@ -74,7 +77,6 @@ class Observation:
     hits: BoolArray | None = None
     sure: Float32Array | None = None
     ends: IntArray | None = None
-    rays: bool = True
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype != np.float32:
@@ -107,6 +109,27 @@ class Observation:
 
     def __len__(self) -> int:
         return len(self.points)
+
+
+class ClassPoints(NamedTuple):
+    """The points of one class that one voter saw.
+
+    Attributes:
+        points: (3, N) float32, metres.
+        grid_T_points: (4, 4).
+        sure: (N,) float32, probability of the class of each point; None: 1.
+    """
+
+    points: Float32Array
+    grid_T_points: Transform
+    sure: Float32Array | None = None
+
+
+SeenClass = tuple[int, Sequence[ClassPoints], Uint16Array, int]
+"""A class, the points of each voter, the (V,) region of each voxel, and the region whose voxels
+count; without regions, all do.
+"""
+EVERYWHERE = np.empty(0, np.uint16), 0
 
 
 def count_votes(
@@ -217,7 +240,8 @@ class Ballot:
             FormatError: a label is not below the class table's number of channels; no vote was
                 added.
         """
-        from carlasc.groundtruth.voting import filled, kernel
+        from carlasc.core.cells import as_pose
+        from carlasc.groundtruth.voting import kernel
 
         self.classes.check(observation.labels, "observation labels")
         ends = np.array([len(observation)]) if observation.ends is None else observation.ends
@@ -233,11 +257,42 @@ class Ballot:
             ends,
         )
         voter = self.num_observations
-        kernel.vote(cast, self._cells, self.free_step_m, voter, observation.rays, self._tally)
+        kernel.vote(cast, self._cells, self.free_step_m, voter, self._tally)
         if self._boxes is not None:
-            filled.widen_boxes(cast, self._cells, self._boxes)
+            voting = observation.labels > 0
+            voting &= True if observation.hits is None else observation.hits
+            for pose, begin, end in zip(cast.poses, [0, *ends], ends, strict=False):
+                points = observation.points[begin:end][voting[begin:end]]
+                self._widen(points.T, as_pose(pose.reshape(3, 4)), *EVERYWHERE)
         # Each origin of rays is a voter, with a number of its own: `once` compares these numbers.
         self.num_observations += len(ends)
+
+    def add_points(self, seen: Iterable[SeenClass]) -> None:
+        """Add the votes of points without rays, one class after the other."""
+        from carlasc.core.cells import as_pose
+        from carlasc.groundtruth.voting import hits
+
+        counted = np.zeros(self.spec.num_voxels + 1, hits.HIT_DTYPE)
+        for label, voters, *within in seen:
+            points = sum(one.points.shape[1] for one in voters)
+            hit, used = np.empty(min(points, len(counted)), np.int32), np.zeros(1, np.int64)
+            certain = all(one.sure is None for one in voters)
+            doubt = np.zeros(0 if certain else len(counted), np.float32)
+            for voter, one in enumerate(voters, 1):
+                pose, sure = as_pose(one.grid_T_points), _ready(one.sure, np.float32)
+                hits.count_hits(
+                    one.points, sure, pose, self._cells, voter, counted, doubt, hit, used
+                )
+                self._widen(one.points, pose, *within)
+            self._make_room(int(used[0]))
+            hits.add_hits(label, counted, doubt, hit[: used[0]], *within, self._tally)
+
+    def _widen(self, points: Float32Array, pose: Pose, regions: Uint16Array, region: int) -> None:
+        from carlasc.groundtruth.voting import filled
+
+        if self._boxes is not None:
+            ready = _ready(points, np.float32)
+            filled.widen_boxes(ready, pose, self._cells, regions, region, self._boxes)
 
     @property
     def free(self) -> AnyArray:

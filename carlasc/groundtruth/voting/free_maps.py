@@ -21,8 +21,8 @@ from carlasc.core.arrays import (
     IntArray,
     Uint32Array,
 )
-from carlasc.core.cells import Cells, Pose, as_pose, transform
-from carlasc.core.compiling import cached, inlined
+from carlasc.core.cells import Cells, Pose, Triple, as_pose, transform
+from carlasc.core.compiling import cached, inlined, jit
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import GridSpec
 
@@ -303,6 +303,41 @@ def _trace(
     return ray
 
 
+@inlined
+def _steps(inside: float, stride: float) -> float:
+    """Return the steps for which a coordinate stays in its cell, from its place in the cell."""
+    return (1.0 - inside) / stride if stride >= 0.0 else inside / -stride
+
+
+@jit
+def _add_column(
+    start: Triple, stride: Triple, slots: Int32Array, counts: Int32Array, column: IntArray
+) -> None:
+    """Add the counts of the cells at `start + k * stride`, in cells from the first one, to
+    `column[k]`.
+    """
+    end_x, end_y, end_z = slots.shape
+    k = 0
+    while k < len(column):
+        x, y, z = start[0] + k * stride[0], start[1] + k * stride[1], start[2] + k * stride[2]
+        i, j, low = math.floor(x), math.floor(y), math.floor(z)
+        # The next ones are above each other, as long as the axes are almost parallel.
+        more = min(_steps(x - i, stride[0]), _steps(y - j, stride[1]))
+        more = min(more, _steps(z - low, stride[2] - 1.0), len(column) - k - 1.0)
+        number = int(more) + 1
+        a, b, end = i >> _BITS, j >> _BITS, min(low + number, end_z << _BITS)
+        if 0 <= a < end_x and 0 <= b < end_y:
+            cell = (((i & (_EDGE - 1)) << _BITS) + (j & (_EDGE - 1))) << _BITS
+            begin = max(low, 0)
+            while begin < end:
+                slot, above = slots[a, b, begin >> _BITS], min((begin | (_EDGE - 1)) + 1, end)
+                if slot >= 0:
+                    for other in range(begin, above):
+                        column[k + other - low] += counts[slot, cell + (other & (_EDGE - 1))]
+                begin = above
+        k += number
+
+
 @cached
 def _gather(
     voxels: IntArray,
@@ -313,55 +348,41 @@ def _gather(
     blocks: _Blocks,
     found: Uint32Array,
 ) -> None:
-    """Sum the counts of the cells in voxels: at places that are evenly spread in each voxel."""
-    first, slots, _, _, counts, _ = blocks
+    """Sum the counts of the cells in voxels: at places that are evenly spread in each voxel.
+
+    Args:
+        voxels: (M,) flat indices; empty: all voxels, column by column.
+        pose: cells_T_grid.
+        cells: the grid.
+        parts: number of cells along the edges of a voxel.
+        volume: of a cell.
+        blocks: the blocks.
+        found: (M,) or (V,) output.
+    """
     across, along, up = parts
-    size, voxel_size = cells.size, cells.voxel_size
-    dx, dy, dz = (
-        pose[2] * voxel_size[2] / up,
-        pose[6] * voxel_size[2] / up,
-        pose[10] * voxel_size[2] / up,
-    )
-    first_x, first_y, first_z = first[0] << _BITS, first[1] << _BITS, first[2] << _BITS
-    end_x = slots.shape[0] << _BITS
-    end_y = slots.shape[1] << _BITS
-    end_z = slots.shape[2] << _BITS
-    for row in range(len(found)):
+    size, voxel_size, first = cells.size, cells.voxel_size, blocks.first
+    height = 1 if len(voxels) else size[2]
+    column = np.empty(height * up, np.int64)
+    rise = voxel_size[2] / up
+    stride = pose[2] * rise, pose[6] * rise, pose[10] * rise
+    for row in range(0, len(found), height):
         voxel = voxels[row] if len(voxels) else row
         i, j, k = voxel // (size[1] * size[2]), voxel // size[2] % size[1], voxel % size[2]
-        low_z = cells.lower[2] + (k + 0.5 / up) * voxel_size[2]
         weight, many = 1.0, along
         if cells.cylindrical and along > 1:
-            radius = cells.lower[0] + (i + 0.5) * voxel_size[0]
-            wide = radius * voxel_size[1]
+            wide = (cells.lower[0] + (i + 0.5) * voxel_size[0]) * voxel_size[1]
             many = int(min(max(math.ceil(2 * wide / voxel_size[0]), 1.0), 16.0))
             weight = wide * voxel_size[0] * voxel_size[2] / (across * many * up * volume)
-        total = 0
+        column[:] = 0
         for a in range(across):
             u = cells.lower[0] + (i + (a + 0.5) / across) * voxel_size[0]
             for b in range(many):
                 x, y = u, cells.lower[1] + (j + (b + 0.5) / many) * voxel_size[1]
                 if cells.cylindrical:
                     x, y = u * math.cos(y), u * math.sin(y)
-                at_x, at_y, at_z = transform(pose, x, y, low_z)
-                for c in range(up):
-                    cell_x = math.floor(at_x + c * dx) - first_x
-                    cell_y = math.floor(at_y + c * dy) - first_y
-                    cell_z = math.floor(at_z + c * dz) - first_z
-                    if (
-                        cell_x < 0
-                        or cell_y < 0
-                        or cell_z < 0
-                        or cell_x >= end_x
-                        or cell_y >= end_y
-                        or cell_z >= end_z
-                    ):
-                        continue
-                    slot = slots[cell_x >> _BITS, cell_y >> _BITS, cell_z >> _BITS]
-                    if slot >= 0:
-                        total += counts[
-                            slot,
-                            ((((cell_x & (_EDGE - 1)) << _BITS) + (cell_y & (_EDGE - 1))) << _BITS)
-                            + (cell_z & (_EDGE - 1)),
-                        ]
-        found[row] = max(round(total * weight), 1) if total > 0 else 0
+                x, y, z = transform(pose, x, y, cells.lower[2] + (k + 0.5 / up) * voxel_size[2])
+                start = x - (first[0] << _BITS), y - (first[1] << _BITS), z - (first[2] << _BITS)
+                _add_column(start, stride, blocks.slots, blocks.counts, column)
+        for k in range(height):
+            total = column[k * up : (k + 1) * up].sum()
+            found[row + k] = max(round(total * weight), 1) if total > 0 else 0

@@ -24,7 +24,7 @@ from carlasc.core.arrays import (
     Uint16Array,
 )
 from carlasc.core.cells import Cells, Pose, transform
-from carlasc.core.compiling import cached, jit
+from carlasc.core.compiling import cached, inlined, jit
 from carlasc.groundtruth.voting.rays import (
     CHUNK,
     DOUBTFUL,
@@ -36,7 +36,6 @@ from carlasc.groundtruth.voting.rays import (
     RayBlock,
     clip,
     empty_rays,
-    locate,
     narrow,
     place_cartesian,
     place_cylindrical,
@@ -108,6 +107,28 @@ class Voters(NamedTuple):
     ends: IntArray
 
 
+@inlined
+def find_candidate(voxel: int, label: int, tally: Tally) -> int:
+    """Return the index of the candidate of a class in a voxel, which is made if there is none."""
+    heads, candidates = tally.heads, tally.candidates
+    entry = heads[voxel]
+    while entry != NONE and candidates[entry].label != label:
+        entry = candidates[entry].next
+    if entry == NONE:
+        entry = tally.used[0]
+        tally.used[0] += 1
+        candidates[entry].votes = candidates[entry].voters = 0
+        candidates[entry].doubt = 0
+        candidates[entry].voxel = voxel
+        # A new candidate becomes the head of the list: classes seen last are looked up first, and
+        # points that follow each other often have one class.
+        candidates[entry].next = heads[voxel]
+        candidates[entry].voter = NONE
+        candidates[entry].label = label
+        heads[voxel] = entry
+    return entry
+
+
 @jit
 def vote_occupied(
     points: Float32Array,
@@ -145,21 +166,7 @@ def vote_occupied(
             if more:
                 candidates[entry].votes += more
             last, label, more = voxel, labels[i], 0
-            entry = heads[voxel]
-            while entry != NONE and candidates[entry].label != label:
-                entry = candidates[entry].next
-            if entry == NONE:
-                entry = tally.used[0]
-                tally.used[0] += 1
-                candidates[entry].votes = candidates[entry].voters = 0
-                candidates[entry].doubt = 0
-                candidates[entry].voxel = voxel
-                # A new candidate becomes the head of the list: classes seen last are looked up
-                # first, and points that follow each other often have one class.
-                candidates[entry].next = heads[voxel]
-                candidates[entry].voter = NONE
-                candidates[entry].label = label
-                heads[voxel] = entry
+            entry = find_candidate(voxel, label, tally)
             # A sum of conditions instead of the branch would make the kernel 1.5 times slower.
             if not once or candidates[entry].voter != voter:
                 candidates[entry].votes += 1
@@ -268,9 +275,7 @@ def vote_free_by_rule(
 
 
 @cached
-def vote(
-    cast: Voters, cells: Cells, free_step_m: float, voter: int, frees: bool, tally: Tally
-) -> None:
+def vote(cast: Voters, cells: Cells, free_step_m: float, voter: int, tally: Tally) -> None:
     """Add the votes of one observation.
 
     Args:
@@ -278,7 +283,6 @@ def vote(
         cells: the cells of the grid.
         free_step_m: distance between two free samples, metres.
         voter: number of the first voter.
-        frees: whether the rays vote for free space.
         tally: the votes so far, with room for N more candidates.
     """
     points, labels, hits, sure, poses, ends = cast
@@ -291,15 +295,11 @@ def vote(
         while begin < ends[place]:
             end = min(begin + BLOCK, ends[place])
             corner, block = points[3 * begin : 3 * end], labels[begin:end]
-            if frees:
-                clip(corner, block, free_step_m, view, rays)
-            else:
-                locate(corner, block, view, rays)
+            clip(corner, block, free_step_m, view, rays)
             place_points(rays, view, voxels[: end - begin])
             own, likely, now = hits[begin:end], sure[begin:end], voter + place
             vote_occupied(corner, block, own, likely, rays, voxels, pose, cells, now, tally)
-            if frees:
-                vote_free(corner, block, rays, pose, view, cells, free_step_m, tally)
+            vote_free(corner, block, rays, pose, view, cells, free_step_m, tally)
             begin = end
         if tally.once:
             for v in range(len(tally.passed)):

@@ -257,18 +257,6 @@ def clip(
 
 
 @jit
-def locate(points: Float32Array, labels: Uint16Array, view: GridView, rays: RayBlock) -> None:
-    """Transform points (3 n,) with labels (n,) to working coordinates, as `clip` does, without
-    their free samples.
-    """
-    for i in range(len(labels)):
-        x, y, z = points[3 * i], points[3 * i + 1], points[3 * i + 2]
-        rays.x[i], rays.y[i], rays.z[i] = transform(view.pose, x, y, z)
-        far = np.sqrt(x * x + y * y + z * z) > view.reach
-        rays.state[i] = DROPPED if (labels[i] == 0) | (x == 0.0) else (UNSURE if far else SURE)
-
-
-@jit
 def place_points(rays: RayBlock, view: GridView, voxels: Int32Array) -> None:
     """Find the voxels of the points of a block: their index, the number of voxels for points
     outside the grid, or DOUBTFUL.
