@@ -3,7 +3,7 @@ import pytest
 
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
-from carlasc.groundtruth.voting.ballot import Ballot, Observation
+from carlasc.groundtruth.voting.ballot import EVERYWHERE, Ballot, ClassPoints, Observation
 
 SPEC = GridSpec("cartesian", (16, 16, 4), (-8, -8, -2), (8, 8, 2))
 
@@ -43,15 +43,53 @@ def test_every_sample_counts_with_the_rule_ray_as_with_sample():
     assert (ray.free >= sensor.free).all() and (ray.free > sensor.free).any()
 
 
+CYLINDER = GridSpec("cylindrical", (8, 24, 4), (0.0, -np.pi, -2), (8.0, np.pi, 2))
+
+
+def by_class(observations, within=EVERYWHERE):
+    """Return the points of observations class by class, each observation a voter."""
+    for label in range(1, 12):
+        yield (
+            label,
+            [
+                ClassPoints(
+                    np.ascontiguousarray(one.points[one.labels == label].T),
+                    one.grid_T_sensor,
+                    None if one.sure is None else one.sure[one.labels == label],
+                )
+                for one in observations
+            ],
+            *within,
+        )
+
+
+@pytest.mark.parametrize("spec", [SPEC, CYLINDER], ids=["cartesian", "cylindrical"])
 @pytest.mark.parametrize("rule", ["sensor", "sample", "ray"])
 @pytest.mark.parametrize("sure", [False, True])
-def test_an_observation_without_rays_leaves_only_its_points(rule, sure):
+def test_points_class_by_class_vote_as_the_points_of_observations_do(rule, sure, spec):
     likely = np.random.default_rng(6).choice([0.25, 0.5, 1.0], 500).astype(np.float32)
     options = {"sure": likely} if sure else {}
-    votes = tally([observation(rays=False, **options)], rule)
-    whole = tally([observation(**options)], rule)
-    assert not votes.free.any() and whole.free.any()
-    assert (votes.occupied == whole.occupied).all()
+    observations = [observation(seed, **options) for seed in range(3)]
+    whole, points = (Ballot(spec, rule=rule, keep_boxes=spec is SPEC) for _ in range(2))
+    for one in observations:
+        whole.add(one)
+    points.add_points(by_class(observations))
+    whole, points = whole.votes(), points.votes()
+    assert (points.occupied == whole.occupied).all() and len(points.occupied) > 500
+    assert not points.free.any() and whole.free.any()
+    np.testing.assert_array_equal(points.boxes, whole.boxes)
+
+
+def test_points_of_a_region_vote_in_its_voxels_only():
+    regions = np.random.default_rng(0).integers(0, 3, SPEC.num_voxels).astype(np.uint16)
+    part, whole = (Ballot(SPEC, rule="ray", keep_boxes=True) for _ in range(2))
+    part.add_points(by_class([observation()], (regions, 2)))
+    whole.add_points(by_class([observation()]))
+    part, whole = part.votes(), whole.votes()
+    assert (part.occupied == whole.occupied[regions[whole.occupied["voxel"]] == 2]).all()
+    inside = (regions == 2)[:, None]
+    empty = Ballot(SPEC, keep_boxes=True).votes().boxes
+    np.testing.assert_array_equal(part.boxes, np.where(inside, whole.boxes, empty))
 
 
 def test_voters_of_one_observation_vote_as_observations_do():

@@ -17,6 +17,7 @@ from carlasc.groundtruth.from_scans.merging import (
     Merger,
     PreparedScan,
 )
+from carlasc.groundtruth.voting.ballot import Ballot
 from carlasc.motion import Extent, Track
 from carlasc.motion.tracks import MovingActors
 from carlasc.storage import FolderSink, FolderSource, layout
@@ -82,58 +83,50 @@ def regions_of(merging, frame=15):
     return BodyRegions.at(merging, instant(frame), FRAMES, SPEC)
 
 
-def observe(merging, frame=15, window=FRAMES):
-    """Return the observations of the static scene and of the actor."""
+def classes(merging, other, frame=15):
+    """Return the classes of the points of a scan that vote on a frame."""
+    return [label for label, *_ in merging.points(instant(frame), [other])]
+
+
+def in_bodies(merging, frame=15, window=FRAMES, **options):
+    """Return the class of the points in the body of the actor, and the points of each scan."""
     now = instant(frame)
-    regions = BodyRegions.at(merging, now, window, SPEC)
-    in_bodies = each_voter(merging.in_bodies(now, window, regions, SPEC))
-    return list(merging.observations(now, window)), in_bodies
+    seen = list(merging.in_bodies(now, window, regions_of(merging, frame), **options))
+    return [(label, one) for label, points, *_ in seen for one in points]
 
 
-def each_voter(observations):
-    """Return the observations of each voter apart."""
-    return [
-        replace(
-            one,
-            points=one.points[a:b],
-            labels=one.labels[a:b],
-            hits=None if one.hits is None else one.hits[a:b],
-            grid_T_sensor=pose,
-            ends=None,
-        )
-        for one in observations
-        for pose, a, b in zip(one.grid_T_sensor, [0, *one.ends[:-1]], one.ends, strict=True)
-    ]
+def in_world(one, frame=15):
+    return transform_points(sensor_pose(frame) @ one.grid_T_points, one.points.T)
 
 
 def voting(observation):
     """Return the classes of the points that vote."""
-    hits = observation.hits
-    return observation.labels[slice(None) if hits is None else hits].tolist()
+    return observation.labels[observation.hits].tolist()
 
 
 def test_a_persons_shape_is_used_for_eight_frames_and_a_vehicles_for_all():
     assert PEDESTRIAN in CARLA.deformable and VEHICLE not in CARLA.deformable
-    assert len(observe(merger(PEDESTRIAN))[1]) == 16
-    assert len(observe(merger(PEDESTRIAN), frame=2)[1]) == 2 + 8
-    assert len(observe(merger(VEHICLE))[1]) == 30
+    assert len(in_bodies(merger(PEDESTRIAN))) == 16
+    assert len(in_bodies(merger(PEDESTRIAN), frame=2)) == 2 + 8
+    assert len(in_bodies(merger(VEHICLE))) == 30
 
 
-def test_an_actors_points_are_carried_to_where_it_is_and_vote_in_its_box_only():
-    _, actor = observe(merger())
-    for observation in actor:
-        assert voting(observation) == [VEHICLE] and not observation.rays
-        place = transform_points(observation.grid_T_sensor, observation.points)
-        truth = transform_points(invert(sensor_pose(15)), actor_pose(15)[None, :3, 3])
-        assert np.abs(place - truth).max() < 1e-5
+def test_an_actors_points_are_carried_to_where_it_is():
+    for label, points in in_bodies(merger()):
+        assert label == VEHICLE
+        assert np.abs(in_world(points) - actor_pose(15)[:3, 3]).max() < 1e-5
 
 
 def test_points_of_an_actor_outside_of_its_region_do_not_vote():
     merging, now = merger(), instant(15)
     regions = regions_of(merging)
     none = replace(regions, of_voxel=np.where(regions.of_voxel == 1, 2, 0).astype(np.uint16))
-    (observation,) = merging.in_bodies(now, FRAMES, none, SPEC)
-    assert voting(observation) == []
+    votes = []
+    for one in (regions, none):
+        ballot = Ballot(SPEC, rule="ray")
+        ballot.add_points(merging.in_bodies(now, FRAMES, one))
+        votes.append(ballot.votes().occupied)
+    assert votes[0]["votes"].sum() == 30 and not len(votes[1])
 
 
 def test_rays_that_miss_the_box_are_not_carried():
@@ -145,12 +138,9 @@ def test_rays_that_miss_the_box_are_not_carried():
         assert np.abs(ends - np.array([np.zeros(3), wall])).max() < 1e-5
 
 
-def test_the_frames_own_rays_are_an_observation_and_those_of_others_are_in_maps():
+def test_the_frames_own_rays_are_an_observation():
     merging = merger()
-    static, _ = observe(merging)
-    assert not any(observation.rays for observation in static)
-    own = merging.own(instant(15))
-    assert own.rays and voting(own) == voting(static[15])
+    assert sorted(voting(merging.own(instant(15)))) == classes(merging, 15)
 
 
 @pytest.mark.parametrize(
@@ -163,10 +153,10 @@ def test_the_frames_own_rays_are_an_observation_and_those_of_others_are_in_maps(
     ],
 )
 def test_which_moving_points_vote(dynamic, own, others):
-    static, _ = observe(merger(dynamic=dynamic))
-    for frame, observation in zip(FRAMES, static, strict=True):
+    for frame in FRAMES:
         moves = own if frame == 15 else others
-        assert voting(observation) == [ROAD, *([VEHICLE] if moves else []), 1]
+        expected = [1, ROAD, *([VEHICLE] if moves else [])]
+        assert classes(merger(dynamic=dynamic), frame) == sorted(expected)
 
 
 def test_points_of_a_track_that_were_not_known_to_move_are_left_out_too():
@@ -194,10 +184,7 @@ def test_points_of_a_track_that_were_not_known_to_move_are_left_out_too():
 def test_points_on_the_recording_vehicle_are_left_out_of_every_frame():
     merging = merger(tracks=[])
     merging.actors = MovingActors(own=(np.array([2.0, 7.0, -2.0, 4.0, 9.0, -1.0]),))
-    now = instant(15)
-    for other in (3, 15):
-        (seen,) = merging.observations(now, [other])
-        assert voting(seen) == [*([VEHICLE] if other == 15 else []), 1]
+    assert classes(merging, 3) == [1] and classes(merging, 15) == sorted([1, VEHICLE])
 
 
 def test_a_track_that_never_moves_is_part_of_the_static_scene():
@@ -243,9 +230,7 @@ def test_moving_points_without_a_body_have_a_region_in_which_the_frames_own_rays
     place = transform_points(invert(sensor_pose(15)), actor_pose(15)[None, :3, 3])
     assert not regions.actors
     assert np.flatnonzero(regions.of_voxel != STATIC).tolist() == SPEC.flat_index(place).tolist()
-    static, actors = observe(merging)
-    assert not actors
-    assert not any(one.rays for one in static)
+    assert not in_bodies(merging)
 
 
 @pytest.mark.parametrize("dynamic", ["drop", "tube"])
@@ -264,30 +249,20 @@ def test_a_frame_without_its_own_scan_has_bodies_and_no_points():
 def test_the_mirror_image_of_an_actor_has_its_points_on_the_other_side():
     merging = merger()
     merging.scan_of(20).points[1] += np.float32([0.0, 0.3, 0.1])
-    now = instant(15)
-    for mirrored, plain in zip(
-        each_voter(merging.in_bodies(now, [20], regions_of(merging), SPEC, mirror=True)),
-        observe(merging, window=[20])[1],
-        strict=True,
-    ):
-        actor_T_grid = invert(invert(sensor_pose(15)) @ actor_pose(15))
-        one = transform_points(actor_T_grid @ plain.grid_T_sensor, plain.points)
-        other = transform_points(actor_T_grid @ mirrored.grid_T_sensor, mirrored.points)
-        assert np.abs(one * [1, -1, 1] - other).max() < 1e-5
-        assert voting(mirrored) == [VEHICLE]
-    assert not list(
-        merger(PEDESTRIAN).in_bodies(now, FRAMES, regions_of(merger(PEDESTRIAN)), SPEC, mirror=True)
+    ((_, plain),) = in_bodies(merging, window=[20])
+    ((label, mirrored),) = in_bodies(merging, window=[20], mirror=True)
+    one, other = (
+        transform_points(invert(actor_pose(15)), in_world(one)) for one in (plain, mirrored)
     )
+    assert np.abs(one).max() > 0.2 and np.abs(one * [1, -1, 1] - other).max() < 1e-5
+    assert label == VEHICLE
+    assert not in_bodies(merger(PEDESTRIAN), mirror=True)
 
 
-def test_what_passes_is_where_it_was_seen_and_frees_nothing():
-    now = instant(15)
-    passing = each_voter(merger().moving(now, [frame for frame in FRAMES if frame != 15]))
-    assert len(passing) == 30
-    for frame, one in zip([f for f in FRAMES if f != 15], passing, strict=True):
-        assert not one.rays and one.labels.tolist() == [VEHICLE]
-        place = transform_points(sensor_pose(15) @ one.grid_T_sensor, one.points)
-        assert np.abs(place - actor_pose(frame)[:3, 3]).max() < 1e-5
+def test_what_passes_is_where_it_was_seen():
+    passing = list(merger().moving(instant(15), FRAMES))
+    for frame, one in zip(FRAMES, passing, strict=True):
+        assert np.abs(in_world(one) - actor_pose(frame)[:3, 3]).max() < 1e-5
 
 
 def test_the_scans_of_an_instant_are_those_within_a_quarter_of_a_second():

@@ -183,6 +183,10 @@ class ScanFeed:
         return self.sequence.frames("points")
 
     @cached_property
+    def _has_times(self) -> bool:
+        return layout.TIMES in self.sequence.documents()
+
+    @cached_property
     def times(self) -> dict[int, float]:
         """Seconds since the first frame, by frame with points."""
         return {frame: self.time(frame) for frame in self.frames.tolist()}
@@ -348,10 +352,14 @@ class ScanFeed:
         first, last = self.options.window
         corners = _corners(spec)
 
-        def corners_of(frame: int) -> FloatArray:
+        def corners_of(frame: int, within_s: float) -> FloatArray:
             near = self.frames[(self.frames >= frame - last) & (self.frames <= frame - first)]
             return np.concatenate(
-                [transform_points(self.pose(other), corners) for other in near.tolist()]
+                [
+                    transform_points(self.pose(other), corners)
+                    for other in near.tolist()
+                    if abs(self.times[other] - self.times[frame]) <= within_s
+                ]
             )
 
         with self._lock:
@@ -366,7 +374,7 @@ class ScanFeed:
 
     def time(self, frame: int) -> float:
         """Return seconds since the first frame."""
-        if layout.TIMES in self.sequence.documents():
+        if self._has_times:
             return self.sequence.read_time(frame)
         return frame * layout.FRAME_PERIOD_S
 

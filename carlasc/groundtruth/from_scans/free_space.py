@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Collection
 
@@ -10,7 +11,7 @@ import numpy as np
 from carlasc.core.arrays import BoolArray, FloatArray, IntArray, Uint32Array
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import GridSpec
-from carlasc.groundtruth.from_scans.merging import MIRROR, BodyRegions, Instant, Merger
+from carlasc.groundtruth.from_scans.merging import MIRROR, RECENT_S, BodyRegions, Instant, Merger
 from carlasc.groundtruth.voting.free_maps import Cast, FreeMap
 
 
@@ -22,8 +23,8 @@ class FreeSpace:
         step_m: distance between two samples of a ray, metres.
         views: count each scan once per voxel, instead of all samples.
         map_T_world: (4, 4), which fixes the cells of the static scene.
-        corners_of: returns the corners of all grids that a scan may be merged into, (N, 3) metres,
-            world.
+        corners_of: returns the corners of the grids that a scan may be merged into, within some
+            seconds, (N, 3) metres, world.
     """
 
     def __init__(
@@ -32,7 +33,7 @@ class FreeSpace:
         step_m: float,
         views: bool,
         map_T_world: Transform,
-        corners_of: Callable[[int], FloatArray],
+        corners_of: Callable[[int, float], FloatArray],
     ) -> None:
         self.key = spec, step_m, views
         self._map_T_world, self._corners_of = map_T_world, corners_of
@@ -64,7 +65,8 @@ class FreeSpace:
         voxels: IntArray | None = None,
     ) -> Uint32Array:
         def cast_of(frame: int) -> Cast:
-            corners = transform_points(self._map_T_world, self._corners_of(frame))
+            within_s = RECENT_S if cells is self._recent else math.inf
+            corners = transform_points(self._map_T_world, self._corners_of(frame, within_s))
             return merger.scan_of(frame).cast(
                 self._map_T_world, corners.min(axis=0), corners.max(axis=0)
             )

@@ -41,7 +41,7 @@ from carlasc.storage import layout
 STATIC = 0  # region of the voxels that belong to no actor
 # fact: deformable
 _DEFORMABLE_S = 0.85  # the shape of a person is used for this time before and after
-_RECENT_S = 0.25  # scans within this time before and after a frame show the scene at the frame
+RECENT_S = 0.25  # scans within this time before and after a frame show the scene at the frame
 # Points so near to the body of an actor may belong to it, as paths have errors: metres along,
 # across and up.
 _AROUND_M = np.array([0.3, 0.3, 0.1])
@@ -343,9 +343,9 @@ class Merger:
             yield ClassPoints(self._moving[other], now.grid_T_world @ scan.world_T_sensor)
 
     def recent(self, now: Instant, window: Iterable[int]) -> list[int]:
-        """Return the frames of the scans within `_RECENT_S` of the frame."""
+        """Return the frames of the scans within `RECENT_S` of the frame."""
         return [
-            other for other in window if abs(self.scan_of(other).seconds - now.seconds) <= _RECENT_S
+            other for other in window if abs(self.scan_of(other).seconds - now.seconds) <= RECENT_S
         ]
 
     def shells(self, now: Instant, regions: BodyRegions) -> Iterator[SeenClass]:

@@ -25,13 +25,14 @@ from carlasc.core.cells import Cells, Pose, Triple, as_pose, transform
 from carlasc.core.compiling import cached, inlined, jit
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import GridSpec
+from carlasc.groundtruth.voting.kernel import BLOCK
+from carlasc.groundtruth.voting.rays import DROPPED, clip, empty_rays, view_from
 
-_BITS = 4  # a block has 2 ** _BITS cells along each edge
+_BITS = 3  # a block has 2 ** _BITS cells along each edge
 _EDGE = 1 << _BITS
 _CELL_M = 0.05  # height of a cell; rays that graze the ground decide it
 _ACROSS, _MOST_UP = 2, 8  # number of cells along the edges of a voxel: in x and y, greatest in z
-_FEWEST = 64  # least number of blocks by which a map grows
-_SLACK = 1e-6  # of the number of a sample, where a ray enters and leaves a region
+_FEWEST = 256  # least number of blocks by which a map grows
 
 
 class Cast(NamedTuple):
@@ -102,7 +103,9 @@ class FreeMap:
         none = np.empty((0, _EDGE**3), np.int32)
         slots = np.empty((0, 0, 0), np.int32)
         left = np.zeros(1, np.int64)
-        self._blocks = _Blocks(np.zeros(3, np.int64), slots, none[:, 0].copy(), left, none, none)
+        self._blocks = _Blocks(
+            np.zeros(3, np.int64), slots, none[:, 0].copy(), left, none, none.copy()
+        )
 
     def hold(self, scans: Collection[int], cast_of: Callable[[int], Cast]) -> None:
         """Add and remove scans, so that the map has the rays of some scans and no others.
@@ -138,8 +141,14 @@ class FreeMap:
     def _trace(self, cast: Cast, lower: IntArray, upper: IntArray, sign: int) -> None:
         self._stamp += 1
         points = np.ascontiguousarray(cast.points).reshape(-1)
-        places = (cast.map_T_places[:, :3] / self._cell[:, None]).reshape(-1, 12)
-        region, numbers = (lower * _EDGE, upper * _EDGE), np.array([sign, self._stamp], np.int32)
+        places = cast.map_T_places[:, :3].reshape(-1, 12)
+        size: tuple[int, int, int] = tuple(((upper - lower) * _EDGE).tolist())
+        low, high = (
+            (float(x), float(y), float(z))
+            for x, y, z in (lower * _EDGE * self._cell, upper * _EDGE * self._cell)
+        )
+        region = Cells(False, size, low, high, tuple(self._cell.tolist()))
+        numbers = np.array([sign, self._stamp, *lower - self._blocks.first], np.int32)
         ray = 0
         while True:
             ray = _trace(
@@ -153,18 +162,13 @@ class FreeMap:
         """Make room for more blocks."""
         old, size = self._blocks, len(self._blocks.counts)
         left, more = int(old.left[0]), max(size // 4, _FEWEST)
-        # zeros take no memory before rays pass through a block
-        counts = np.zeros((size + more, _EDGE**3), np.int32)
-        counts[:size] = old.counts
-        stamps = old.stamps
-        if self.views:
-            stamps = np.zeros_like(counts)
-            stamps[:size] = old.stamps
+        for cells in (old.counts, old.stamps) if self.views else (old.counts,):
+            cells.resize((size + more, _EDGE**3), refcheck=False)  # without a copy
         # the last ones are taken first: memory that was used before
         unused = np.concatenate([np.arange(size + more - 1, size - 1, -1), old.unused[:left]])
         unused = np.concatenate([unused, np.zeros(size - left, np.int64)]).astype(np.int32)
         old.left[0] = left + more
-        self._blocks = old._replace(counts=counts, stamps=stamps, unused=unused)
+        self._blocks = old._replace(unused=unused)
 
     def _make_room(self, lower: IntArray, upper: IntArray) -> None:
         """Extend the index of blocks to a region, and release blocks that no region contains."""
@@ -204,27 +208,13 @@ class FreeMap:
         return found
 
 
-@inlined
-def _narrow(
-    step: float, last: float, start: float, stride: float, low: int, high: int
-) -> tuple[float, float]:
-    """Return the steps between `step` and `last` at which `start - step * stride` is between `low`
-    and `high`.
-    """
-    # comparisons with NaN (0 / 0) are false
-    inverse = 1.0 / stride
-    a, b = (start - low) * inverse, (start - high) * inverse
-    near, far = (a, b) if a < b else (b, a)
-    return (near if near > step else step), (far if far < last else last)
-
-
 @cached
 def _trace(
     points: Float32Array,
     ends: IntArray,
     poses: FloatArray,
     ray: int,
-    region: tuple[IntArray, IntArray],
+    region: Cells,
     samples: tuple[float, float],
     numbers: Int32Array,
     blocks: _Blocks,
@@ -235,72 +225,61 @@ def _trace(
     Args:
         points: (3 N,) metres, from the origins of the rays.
         ends: (K,) index after the last point of each origin.
-        poses: (K, 12) cells_T_place of the origins.
+        poses: (K, 12) map_T_place of the origins.
         ray: the first ray.
-        region: (3,) first cell of the region, and the cell after the last one.
+        region: the cells of the region, of whole blocks.
         samples: number of the first sample on a ray, and the distance between two, metres.
         numbers: 1 or -1, and a number of this call, which the cells that it changes get if views
-            are counted.
+            are counted; then (3,) the first block of the region, counted from that of the map.
         blocks: the blocks.
     """
-    first, slots, unused, left, counts, stamps = blocks
-    views, step_m, sign, stamp = len(stamps) > 0, samples[1], numbers[0], numbers[1]
-    lower, upper = region
-    low_x, low_y, low_z = lower[0], lower[1], lower[2]
-    high_x, high_y, high_z = upper[0], upper[1], upper[2]
+    _, slots, unused, left, counts, stamps = blocks
+    views, sign, stamp = len(stamps) > 0, numbers[0], numbers[1]
+    block_x, block_y, block_z = numbers[2], numbers[3], numbers[4]
+    rays, labels = empty_rays(BLOCK), np.ones(BLOCK, np.uint16)
+    top_x, top_y, top_z = region.size[0] - 1.0, region.size[1] - 1.0, region.size[2] - 1.0
     for place in range(len(ends)):
         p = poses[place]
         pose = (p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11])
-        for i in range(ray, ends[place]):
-            x, y, z = (
-                np.float64(points[3 * i]),
-                np.float64(points[3 * i + 1]),
-                np.float64(points[3 * i + 2]),
-            )
-            norm = math.sqrt(x * x + y * y + z * z)
-            if norm == 0.0:
-                continue
-            at_x, at_y, at_z = transform(pose, x, y, z)
-            share = step_m / norm
-            dx, dy, dz = (at_x - p[3]) * share, (at_y - p[7]) * share, (at_z - p[11]) * share
-            step, last = samples[0], np.ceil(norm / step_m) - 1.0
-            step, last = _narrow(step, last, at_x, dx, low_x, high_x)
-            step, last = _narrow(step, last, at_y, dy, low_y, high_y)
-            step, last = _narrow(step, last, at_z, dz, low_z, high_z)
-            step, last = np.ceil(step - _SLACK), np.floor(last + _SLACK)
-            if left[0] <= last - step:
-                return i
-            while step <= last:
-                cell_x = math.floor(at_x - step * dx)
-                cell_y = math.floor(at_y - step * dy)
-                cell_z = math.floor(at_z - step * dz)
-                step += 1.0
-                if (
-                    cell_x < low_x
-                    or cell_y < low_y
-                    or cell_z < low_z
-                    or cell_x >= high_x
-                    or cell_y >= high_y
-                    or cell_z >= high_z
-                ):
+        view = view_from(pose, region)
+        while ray < ends[place]:
+            count = min(BLOCK, ends[place] - ray)
+            clip(points[3 * ray : 3 * (ray + count)], labels[:count], *samples, view, rays)
+            for i in range(count):
+                x, y, z, step, last = rays.x[i], rays.y[i], rays.z[i], rays.first[i], rays.last[i]
+                dx, dy, dz = rays.dx[i], rays.dy[i], rays.dz[i]
+                if rays.state[i] == DROPPED or last < step:
                     continue
-                a = (cell_x >> _BITS) - first[0]
-                b = (cell_y >> _BITS) - first[1]
-                c = (cell_z >> _BITS) - first[2]
-                slot = slots[a, b, c]
-                if slot < 0:
-                    left[0] -= 1
-                    slot = slots[a, b, c] = unused[left[0]]
-                cell = ((((cell_x & (_EDGE - 1)) << _BITS) + (cell_y & (_EDGE - 1))) << _BITS) + (
-                    cell_z & (_EDGE - 1)
-                )
-                if views:
-                    if stamps[slot, cell] == stamp:
-                        continue
-                    stamps[slot, cell] = stamp
-                counts[slot, cell] += sign
-        ray = max(ray, ends[place])
+                if left[0] <= last - step:
+                    return ray + i
+                while step <= last:
+                    # clipped, as rounding may put samples beyond the region
+                    cell_x = int(min(max(x - step * dx, 0.0), top_x))
+                    cell_y = int(min(max(y - step * dy, 0.0), top_y))
+                    cell_z = int(min(max(z - step * dz, 0.0), top_z))
+                    step += 1.0
+                    a = (cell_x >> _BITS) + block_x
+                    b = (cell_y >> _BITS) + block_y
+                    c = (cell_z >> _BITS) + block_z
+                    slot = slots[a, b, c]
+                    if slot < 0:
+                        left[0] -= 1
+                        slot = slots[a, b, c] = unused[left[0]]
+                    cell = _in_block(cell_x, cell_y, cell_z)
+                    if views:
+                        if stamps[slot, cell] == stamp:
+                            continue
+                        stamps[slot, cell] = stamp
+                    counts[slot, cell] += sign
+            ray += count
     return ray
+
+
+@inlined
+def _in_block(x: int, y: int, z: int) -> int:
+    """Return the index of a cell in its block."""
+    last = _EDGE - 1
+    return ((((x & last) << _BITS) + (y & last)) << _BITS) + (z & last)
 
 
 @inlined
@@ -327,7 +306,7 @@ def _add_column(
         number = int(more) + 1
         a, b, end = i >> _BITS, j >> _BITS, min(low + number, end_z << _BITS)
         if 0 <= a < end_x and 0 <= b < end_y:
-            cell = (((i & (_EDGE - 1)) << _BITS) + (j & (_EDGE - 1))) << _BITS
+            cell = _in_block(i, j, 0)
             begin = max(low, 0)
             while begin < end:
                 slot, above = slots[a, b, begin >> _BITS], min((begin | (_EDGE - 1)) + 1, end)
