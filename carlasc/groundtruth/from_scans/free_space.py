@@ -95,7 +95,7 @@ class FreeSpace:
             voxels = np.flatnonzero(regions.of_voxel == region)
             map_T_grid = (MIRROR if mirror else np.eye(4)) @ invert(pose) @ now.world_T_grid
             with self._lock:
-                cells = self._bodies.setdefault(number, FreeMap(*self.key))
+                cells = self._bodies.setdefault(number, FreeMap(*self.key, fine=True))
                 cells.hold(casts, casts.__getitem__)
                 free[voxels] += cells.count(map_T_grid, voxels)
 

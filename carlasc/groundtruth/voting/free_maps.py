@@ -31,7 +31,7 @@ from carlasc.groundtruth.voting.rays import DROPPED, clip, empty_rays, view_from
 _BITS = 3  # a block has 2 ** _BITS cells along each edge
 _EDGE = 1 << _BITS
 _CELL_M = 0.05  # height of a cell; rays that graze the ground decide it
-_ACROSS, _MOST_UP = 2, 8  # number of cells along the edges of a voxel: in x and y, greatest in z
+_MOST = 8  # greatest number of cells along an edge of a voxel; the least is 2
 _FEWEST = 256  # least number of blocks by which a map grows
 
 
@@ -81,18 +81,25 @@ class FreeMap:
         step_m: distance between two samples of a ray, metres.
         views: count the scans that saw each voxel, instead of samples in cells.
         first: number of the first sample on a ray, counted from its point; 0: the point itself.
+        fine: make the cells as small in x and y as in z, for small things.
     """
 
     def __init__(
-        self, spec: GridSpec, step_m: float, views: bool = False, *, first: int = 1
+        self,
+        spec: GridSpec,
+        step_m: float,
+        views: bool = False,
+        *,
+        first: int = 1,
+        fine: bool = False,
     ) -> None:
         x, y, z = spec.voxel_size.tolist()
-        up = min(max(round(z / _CELL_M), _ACROSS), _MOST_UP)
         # a cylindrical voxel is as wide as deep at some radius
         size = (x, x if spec.coordinates == "cylindrical" else y, z)
+        parts = [min(max(round(edge / _CELL_M), 2), _MOST) for edge in size]
         self.spec, self.views, self._stamp = spec, views, 0
         self._samples = float(first), step_m
-        self._parts = (1, 1, 1) if views else (_ACROSS, _ACROSS, up)
+        self._parts = (1, 1, 1) if views else (*(parts[:2] if fine else (2, 2)), parts[2])
         self._cell = np.array(size) / self._parts
         self._margin_m = np.linalg.norm(size)  # a voxel that touches a region is counted whole
         self._held = dict[int, tuple[Cast, IntArray, IntArray]]()
@@ -330,7 +337,7 @@ def _gather(
     """Sum the counts of the cells in voxels: at places that are evenly spread in each voxel.
 
     Args:
-        voxels: (M,) flat indices; empty: all voxels, column by column.
+        voxels: (M,) flat indices; empty: all voxels. Those above each other are read together.
         pose: cells_T_grid.
         cells: the grid.
         parts: number of cells along the edges of a voxel.
@@ -340,18 +347,24 @@ def _gather(
     """
     across, along, up = parts
     size, voxel_size, first = cells.size, cells.voxel_size, blocks.first
-    height = 1 if len(voxels) else size[2]
-    column = np.empty(height * up, np.int64)
+    columns, row = np.empty(size[2] * up, np.int64), 0
     rise = voxel_size[2] / up
     stride = pose[2] * rise, pose[6] * rise, pose[10] * rise
-    for row in range(0, len(found), height):
+    while row < len(found):
         voxel = voxels[row] if len(voxels) else row
         i, j, k = voxel // (size[1] * size[2]), voxel // size[2] % size[1], voxel % size[2]
-        weight, many = 1.0, along
+        height, weight, many = 1, 1.0, along
+        while (
+            row + height < len(found)
+            and k + height < size[2]
+            and (len(voxels) == 0 or voxels[row + height] == voxel + height)
+        ):
+            height += 1
         if cells.cylindrical and along > 1:
             wide = (cells.lower[0] + (i + 0.5) * voxel_size[0]) * voxel_size[1]
             many = int(min(max(math.ceil(2 * wide / voxel_size[0]), 1.0), 16.0))
             weight = wide * voxel_size[0] * voxel_size[2] / (across * many * up * volume)
+        column = columns[: height * up]
         column[:] = 0
         for a in range(across):
             u = cells.lower[0] + (i + (a + 0.5) / across) * voxel_size[0]
@@ -365,3 +378,4 @@ def _gather(
         for k in range(height):
             total = column[k * up : (k + 1) * up].sum()
             found[row + k] = max(round(total * weight), 1) if total > 0 else 0
+        row += height
