@@ -36,9 +36,11 @@ from .results import Evaluation as Evaluation
 from .results import FigureTable as FigureTable
 from .results import FrameScore as FrameScore
 from .results import Interval as Interval
-from .results import bootstrap as bootstrap
 from .results import compare as compare
+from .results import confidence_interval as confidence_interval
 from .results import geometric_table as geometric_table
+from .results import interval_of as interval_of
+from .results import jackknife as jackknife
 from .results import semantic_table as semantic_table
 from .scoring import Scoring as Scoring
 from .temporal import Consistency as Consistency

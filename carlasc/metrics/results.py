@@ -1,9 +1,8 @@
 """The scores of predictions over a data set, confidence intervals, and tables as text, LaTeX and
 CSV.
 
-Confidence intervals are computed by bootstrap over sequences, and a paired test compares two
-predictions. Both resample sequences instead of frames, because the frames of one sequence show
-nearly the same scene.
+Confidence intervals hold for other sequences, and a paired test compares two predictions. Both
+take sequences instead of frames, because the frames of one sequence show nearly the same scene.
 """
 
 from __future__ import annotations
@@ -29,7 +28,8 @@ Cell = str | float
 Score = Callable[[ConfusionMatrix], float]
 _FEWEST_SEQUENCES = 5
 _LEVEL = 0.95  # of confidence
-_DRAWS, _SEED, _EXACT = 2000, 0, 12  # fact: draws
+_DRAWS, _SEED, _EXACT = 2000, 0, 12  # of swaps; fact: draws
+_NEARLY_NORMAL = 1000.0  # degrees of freedom of Student's t
 
 
 @dataclass(frozen=True)
@@ -203,12 +203,12 @@ class Evaluation:
         return sum(values) / len(values) if values and self.matrix.total else math.nan
 
     def interval(self) -> Interval | None:
-        """Return the confidence interval of `miou` by bootstrap over sequences; None for fewer than
-        five sequences.
-        """
+        """Return the confidence interval of `miou`; None for fewer than five sequences."""
         if len(self.sequences) < _FEWEST_SEQUENCES:
             return None
-        return bootstrap(list(self.sequences.values()), lambda m: self.convention.score(m).miou)
+        return confidence_interval(
+            list(self.sequences.values()), lambda m: self.convention.score(m).miou
+        )
 
     def compare(self, other: Evaluation) -> Comparison:
         """Compare with other predictions of the same sequences by a paired test.
@@ -406,9 +406,44 @@ class Comparison:
         }
 
 
-def bootstrap(matrices: Sequence[ConfusionMatrix], score: Score) -> Interval:
-    """Return a score with its confidence interval by bootstrap: sequences are resampled with
-    replacement.
+def interval_of(value: float, *parts: tuple[float, float]) -> Interval:
+    """Return the interval of a value whose variance is a sum of independent parts, by Student's t
+    with the degrees of freedom of Welch and Satterthwaite.
+
+    Args:
+        value: the value.
+        parts: variance and degrees of freedom of each part.
+    """
+    variance = sum(part for part, _ in parts)
+    if not variance > 0:
+        bound = 0.0 if variance == 0 else math.nan
+        return Interval(value, value - bound, value + bound)
+    freedom = variance**2 / sum(part**2 / degrees for part, degrees in parts)
+    # With t = sqrt(freedom) * tan(angle), the density over the angle is cos(angle)^(freedom - 1).
+    angle = np.linspace(0, np.pi / 2, 2_001)
+    mass = np.cos(angle) ** (min(freedom, _NEARLY_NORMAL) - 1)
+    below = np.concatenate(([0], np.cumsum(mass[1:] + mass[:-1])))
+    tangent = math.tan(np.interp(_LEVEL, below / below[-1], angle))
+    bound = math.sqrt(min(freedom, _NEARLY_NORMAL) * variance) * tangent
+    return Interval(value, value - bound, value + bound)
+
+
+def jackknife(figure: Callable[[IntArray], float], counts: IntArray) -> tuple[float, float]:
+    """Return the variance of a figure over independent samples, and its degrees of freedom, for
+    `interval_of`: the figure is computed without each sample in turn.
+
+    Args:
+        figure: the figure of the samples that are left.
+        counts: (N, ...) what was counted in each sample.
+    """
+    left = np.array([figure(np.delete(counts, i, 0)) for i in range(len(counts))])
+    left = left[np.isfinite(left)]
+    degrees = len(left) - 1
+    return (float(degrees * left.var()), degrees) if degrees > 0 else (math.nan, 1)
+
+
+def confidence_interval(matrices: Sequence[ConfusionMatrix], score: Score) -> Interval:
+    """Return a score with its confidence interval, by the jackknife over sequences.
 
     Args:
         matrices: confusion matrix of each sequence.
@@ -419,11 +454,11 @@ def bootstrap(matrices: Sequence[ConfusionMatrix], score: Score) -> Interval:
     """
     _check_number(len(matrices))
     counts = np.stack([matrix.counts for matrix in matrices])
-    draws = np.random.default_rng(_SEED).integers(0, len(counts), (_DRAWS, len(counts)))
-    value, *values = (
-        score(_matrix(counts[rows].sum(axis=0), matrices[0])) for rows in (slice(None), *draws)
-    )
-    return _interval(value, values)
+
+    def figure(counts: IntArray) -> float:
+        return score(_matrix(counts.sum(axis=0), matrices[0]))
+
+    return interval_of(figure(counts), jackknife(figure, counts))
 
 
 def compare(
@@ -433,7 +468,7 @@ def compare(
 ) -> Comparison:
     """Compare two predictions, sequence by sequence.
 
-    For the interval, the same sequences are resampled for both predictions. For the p-value, the
+    The interval is that of the difference by the jackknife over sequences. For the p-value, the
     predictions are swapped in subsets of the sequences: all subsets for up to twelve sequences,
     2,000 random subsets for more.
 
@@ -454,46 +489,31 @@ def compare(
         )
     _check_number(len(common))
     like = first[common[0]]
-    a, b = (np.stack([side[path].counts for path in common]) for side in (first, second))
 
-    def difference(one: IntArray, other: IntArray) -> float:
+    def difference(pairs: IntArray) -> float:
+        one, other = pairs.sum(axis=0)
         return score(_matrix(one, like)) - score(_matrix(other, like))
 
-    observed = difference(a.sum(axis=0), b.sum(axis=0))
-    rng = np.random.default_rng(_SEED)
-    draws = rng.integers(0, len(common), (_DRAWS, len(common)))
-    spread = [difference(a[draw].sum(axis=0), b[draw].sum(axis=0)) for draw in draws]
+    pairs = np.array([(first[path].counts, second[path].counts) for path in common])
+    interval = interval_of(difference(pairs), jackknife(difference, pairs))
     if len(common) <= _EXACT:
         swaps = (np.arange(2 ** len(common))[:, None] >> np.arange(len(common)) & 1).astype(bool)
     else:
-        swaps = rng.random((_DRAWS, len(common))) < 0.5
+        swaps = np.random.default_rng(_SEED).random((_DRAWS, len(common))) < 0.5
         swaps[0] = False  # the first one is the actual assignment
-    swapped = [
-        difference(
-            np.where(s[:, None, None], b, a).sum(axis=0),
-            np.where(s[:, None, None], a, b).sum(axis=0),
-        )
-        for s in swaps
-    ]
-    p_value = float(np.mean(np.abs(swapped) >= abs(observed) - 1e-12))
-    return Comparison(_interval(observed, spread), p_value, common)
+    swapped = [difference(np.where(s[:, None, None, None], pairs[:, ::-1], pairs)) for s in swaps]
+    p_value = float(np.mean(np.abs(swapped) >= abs(interval.value) - 1e-12))
+    return Comparison(interval, p_value, common)
 
 
 def _check_number(sequences: int) -> None:
     if sequences < _FEWEST_SEQUENCES:
         raise ArgumentError(
             "sequences",
-            expected=f"at least {_FEWEST_SEQUENCES} sequences to resample",
+            expected=f"at least {_FEWEST_SEQUENCES} sequences",
             found=str(sequences),
         )
 
 
 def _matrix(counts: IntArray, like: ConfusionMatrix) -> ConfusionMatrix:
     return ConfusionMatrix(like.num_classes, free=like.free, counts=counts)
-
-
-def _interval(value: float, draws: Sequence[float]) -> Interval:
-    if np.isnan(draws).all():
-        return Interval(value, math.nan, math.nan)
-    low, high = np.nanquantile(draws, [(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
-    return Interval(value, float(low), float(high))

@@ -13,7 +13,7 @@ known to both count. WORK keeps the drives; the default is a temporary folder.
 - velocity: mean length of the difference over the voxels that move in both, m/s; beside it the
   share of the moving voxels that have one.
 
-The tables are means over the drives of each world, with 95 % intervals by the bootstrap over them.
+The tables are means over the drives of each world, with 95 % intervals over them.
 """
 
 from __future__ import annotations

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.scans import Scan
+from carlasc.metrics import interval_of
 
 T = TypeVar("T")
 _TINY = ContextVar("tiny", default=False)
@@ -107,15 +108,13 @@ def labels_of(scan: Scan) -> NDArray[np.unsignedinteger]:
 
 
 def interval(values: Iterable[float], shown: str = ".2f") -> str:
-    """Return the mean over drives, with its 95 % interval by the bootstrap over them if there are
-    several.
-    """
+    """Return the mean over drives, with its 95 % interval by Student's t if there are several."""
     found = np.array([value for value in values if not np.isnan(value)], np.float64)
     if len(found) < 2:
         return f"{found.mean():{shown}}" if len(found) else ""
-    means = np.random.default_rng(0).choice(found, (2000, len(found))).mean(axis=1)
-    low, high = np.quantile(means, (0.025, 0.975))
-    return f"{found.mean():{shown}} ({low:{shown}} to {high:{shown}})"
+    degrees = len(found) - 1
+    bounds = interval_of(float(found.mean()), (found.var(ddof=1) / len(found), degrees))
+    return f"{bounds.value:{shown}} ({bounds.low:{shown}} to {bounds.high:{shown}})"
 
 
 class Clock:

@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from benchmarking.runs import Result
 from carlasc.core import CARLASC11
-from carlasc.metrics import FigureTable
+from carlasc.metrics import FigureTable, Interval, interval_of, jackknife
 
 VEHICLE, PEDESTRIAN = CARLASC11.id_of("Vehicles"), CARLASC11.id_of("Pedestrian")
 FREE = 0
 Counts = NDArray[np.floating | np.integer]  # (..., K, K) confusion matrices, rows are the truth
 Figure = Callable[[Counts], NDArray[np.float64]]
-_DRAWS = 2000
 
 
 def iou(counts: Counts, label: int) -> NDArray[np.float64]:
@@ -102,36 +101,30 @@ def figure_table(
     )
 
 
-def difference(
-    first: Sequence[Result], second: Sequence[Result], figure: Figure
-) -> tuple[float, float, float]:
-    """Return by how much a figure of the first runs is higher than that of the second, and the
-    bounds of its 95 % interval.
-
-    The test drives are drawn again (bootstrap), the same for both; and the runs of each, so that
-    the interval holds for other towns and other seeds. With one run of each it holds for other
+def difference(first: Sequence[Result], second: Sequence[Result], figure: Figure) -> Interval:
+    """Return by how much a figure of the first runs is higher than that of the second, and its
+    95 % interval, which holds for other towns and other seeds; with one run of each, for other
     towns only.
+
+    The variance over test drives is that of the difference, because both are tested on the same;
+    that over seeds is the sum of both sides.
     """
-    rng = np.random.default_rng(0)
-    drives = len(first[0].drives)
-    drawn = rng.multinomial(drives, np.full(drives, 1 / drives), _DRAWS)
-    drawn[0] = 1  # the drives as they are
-    means = []
-    for runs in (first, second):
-        values = figure(np.einsum("rd,sdkl->rskl", drawn, np.stack([run.drives for run in runs])))
-        chosen = rng.integers(0, len(runs), (_DRAWS, len(runs)))
-        chosen[0] = range(len(runs))
-        means.append(np.take_along_axis(values, chosen, 1).mean(1))
-    found = means[0] - means[1]
-    low, high = np.percentile(found[1:], (2.5, 97.5))
-    return float(found[0]), float(low), float(high)
+    sides = [np.stack([run.drives for run in runs]) for runs in (first, second)]
+    seeds = [figure(side.sum(axis=1)) for side in sides]
+
+    def of_drives(drives: Counts) -> float:
+        runs = figure(drives.sum(axis=0))
+        return float(runs[: len(first)].mean() - runs[len(first) :].mean())
+
+    drives = jackknife(of_drives, np.concatenate(sides).swapaxes(0, 1))
+    parts = [(float(of.var(ddof=1)) / len(of), len(of) - 1) for of in seeds if len(of) > 1]
+    return interval_of(float(seeds[0].mean() - seeds[1].mean()), drives, *parts)
 
 
-def with_interval(found: tuple[float, float, float]) -> str:
+def with_interval(found: Interval) -> str:
     """Return a difference and its interval as text; bold where the interval does not hold zero."""
-    value, low, high = found
-    text = f"{value:+.1f} ({low:+.1f} to {high:+.1f})"
-    return f"**{text}**" if low * high > 0 else text
+    text = f"{found.value:+.1f} ({found.low:+.1f} to {found.high:+.1f})"
+    return f"**{text}**" if found.low * found.high > 0 else text
 
 
 def spread(values: Sequence[float]) -> str:

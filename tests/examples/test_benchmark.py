@@ -16,6 +16,7 @@ from carlasc import open as open_source
 from carlasc.captures import Lidar
 from carlasc.core import CARLA, CARLASC11, translation
 from carlasc.errors import ConflictError
+from carlasc.metrics import Interval
 
 pytest.importorskip("torch", reason="needs carlasc[torch]")
 
@@ -264,16 +265,17 @@ def test_seeds_are_averaged_and_their_spread_is_told():
 
 def test_a_difference_that_every_drive_and_seed_shows_is_sure_and_one_of_a_single_drive_is_not():
     vehicles = NETWORK[VEHICLES]
-    assert difference([result(60), result(62)], [result(40), result(42)], vehicles)[1] > 0
+    assert difference([result(60), result(62)], [result(40), result(42)], vehicles).low > 0
     same = difference([result(60), result(40)], [result(40), result(60)], vehicles)
-    assert same[0] == 0
-    assert same[1] < 0 < same[2]
+    assert same.value == 0
+    assert same.low < 0 < same.high
     better = result(40)
     better.drives[0] = result(80).drives[0]
-    value, low, high = difference([better], [result(40)], vehicles)
-    assert (value, low, high) == pytest.approx((20, 0, 40))
-    assert with_interval((20.0, 0.0, 40.0)) == "+20.0 (+0.0 to +40.0)"
-    assert with_interval((2.0, 1.0, 3.0)) == "**+2.0 (+1.0 to +3.0)**"
+    one = difference([better], [result(40)], vehicles)
+    assert one.value == pytest.approx(20)
+    assert one.low < 0 < one.high
+    assert with_interval(Interval(20.0, 0.0, 40.0)) == "+20.0 (+0.0 to +40.0)"
+    assert with_interval(Interval(2.0, 1.0, 3.0)) == "**+2.0 (+1.0 to +3.0)**"
 
 
 def test_a_study_that_was_stopped_has_equally_many_seeds_of_each_row():

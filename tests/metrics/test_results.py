@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from carlasc.errors import ArgumentError, MissingDataError
-from carlasc.metrics import ConfusionMatrix, bootstrap, compare
+from carlasc.metrics import ConfusionMatrix, compare, confidence_interval, interval_of, jackknife
 
 
 def matrices(accuracies, seed=0, size=4000):
@@ -22,25 +22,50 @@ def accuracy(matrix):
 
 
 def test_an_interval_holds_the_score_and_is_wide_where_sequences_differ():
-    alike = bootstrap(list(matrices([0.6] * 8).values()), accuracy)
-    apart = bootstrap(list(matrices(np.linspace(0.2, 0.9, 8)).values()), accuracy)
+    alike = confidence_interval(list(matrices([0.6] * 8).values()), accuracy)
+    apart = confidence_interval(list(matrices(np.linspace(0.2, 0.9, 8)).values()), accuracy)
     for interval in (alike, apart):
         assert interval.low <= interval.value <= interval.high
     assert alike.high - alike.low < 0.03 < apart.high - apart.low
-    # the same draws each time
-    assert bootstrap(list(matrices([0.6] * 8).values()), accuracy) == alike
+    # nothing is drawn
+    assert confidence_interval(list(matrices([0.6] * 8).values()), accuracy) == alike
 
 
-@pytest.mark.slow
-def test_95_percent_of_intervals_hold_the_true_value():
-    rng = np.random.default_rng(1)
+@pytest.mark.parametrize("number", [5, 8, 20])
+def test_95_percent_of_intervals_hold_the_true_score_of_all_sequences(number):
+    """The sequences differ much more than chance within each: the score is a ratio of sums."""
+    rng = np.random.default_rng(number)
     held = 0
-    for trial in range(60):
-        interval = bootstrap(
-            list(matrices(rng.normal(0.6, 0.1, 12), trial, 600).values()), accuracy
-        )
-        held += interval.low <= 0.6 + 0.4 / 3 <= interval.high
-    assert held >= 50
+    for _ in range(1000):
+        size = rng.integers(300, 600, number)
+        right = rng.binomial(size, rng.beta(6, 4, number))
+
+        def ratio(counts):
+            return float(counts[:, 0].sum() / counts[:, 1].sum())
+
+        counts = np.stack([right, size], axis=1)
+        interval = interval_of(ratio(counts), jackknife(ratio, counts))
+        held += interval.low <= 0.6 <= interval.high
+    assert 930 <= held <= 970
+
+
+def test_95_percent_of_intervals_hold_a_difference_over_few_seeds_and_drives():
+    """Three seeds of each network, and six drives that both have: the two variances differ."""
+    rng = np.random.default_rng(0)
+    held = 0
+    for _ in range(1000):
+        drives = rng.normal(0, 2, 6)
+        seeds = [rng.normal(0, deviation, 3) for deviation in (3, 1)]
+        parts = [(seed.var(ddof=1) / 3, 2) for seed in seeds]
+        value = drives.mean() + seeds[0].mean() - seeds[1].mean()
+        interval = interval_of(value, (drives.var(ddof=1) / 6, 5), *parts)
+        held += interval.low <= 0 <= interval.high
+    assert 930 <= held <= 970
+
+
+@pytest.mark.parametrize(("degrees", "bound"), [(1, 12.706), (2, 4.303), (4.5, 2.659), (1e9, 1.962)])
+def test_bounds_are_those_of_the_tables_of_student(degrees, bound):
+    assert interval_of(3.0, (1.0, degrees)).high == pytest.approx(3 + bound, abs=2e-3)
 
 
 def test_a_clear_difference_is_seen():
@@ -72,8 +97,8 @@ def test_the_test_of_equals_is_wrong_as_often_as_it_says():
 
 def test_fewer_than_five_sequences_say_nothing():
     few = matrices([0.5] * 4)
-    with pytest.raises(ArgumentError, match="at least 5 sequences to resample, found 4"):
-        bootstrap(list(few.values()), accuracy)
+    with pytest.raises(ArgumentError, match="at least 5 sequences, found 4"):
+        confidence_interval(list(few.values()), accuracy)
     with pytest.raises(ArgumentError, match="at least 5"):
         compare(few, few, accuracy)
     with pytest.raises(MissingDataError, match="sequences of the first"):
