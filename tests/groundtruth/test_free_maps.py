@@ -22,19 +22,19 @@ def cast(seed, count=400, places=1, room=ROOM):
     return Cast(points, ends, poses, -room, room)
 
 
-def samples(rays, first=1):
+def samples(rays):
     """Return the samples of rays, frame of the map."""
     found = [np.empty((0, 3))]
     for pose, a, b in zip(rays.map_T_places, [0, *rays.ends[:-1]], rays.ends, strict=True):
         for point in rays.points[a:b].astype(np.float64):
             norm = np.linalg.norm(point)
-            steps = np.arange(first, int(np.ceil(norm / STEP_M)))[:, None]
+            steps = np.arange(1, int(np.ceil(norm / STEP_M)))[:, None]
             found.append(transform_points(pose, point - steps * STEP_M * point / norm))
     return np.concatenate(found)
 
 
-def plain(casts, spec=SPEC, first=1):
-    voxels = spec.flat_index(np.concatenate([samples(rays, first) for rays in casts]))
+def plain(casts, spec=SPEC):
+    voxels = spec.flat_index(np.concatenate([samples(rays) for rays in casts]))
     return np.bincount(voxels[voxels >= 0], minlength=spec.num_voxels)
 
 
@@ -45,11 +45,11 @@ def held(casts, scans=None, **options):
 
 
 @pytest.mark.parametrize("places", [1, 3])
-@pytest.mark.parametrize("first", [0, 1])
-def test_voxels_that_lie_on_the_cells_have_all_samples_in_them(places, first):
+@pytest.mark.parametrize("fine", [False, True])
+def test_voxels_that_lie_on_the_cells_have_all_samples_in_them(places, fine):
     casts = [cast(seed, places=places) for seed in range(3)]
-    found = held(casts, first=first).count(np.eye(4))
-    assert np.count_nonzero(found != plain(casts, first=first)) <= 2  # at an edge, by rounding
+    found = held(casts, fine=fine).count(np.eye(4))
+    assert np.count_nonzero(found != plain(casts)) <= 2  # at an edge, by rounding
     assert found.sum() > 1000
 
 
@@ -99,8 +99,8 @@ def test_a_scan_that_cannot_be_read_leaves_the_map_as_it_was():
 
 def test_views_count_scans_and_not_samples():
     casts = [cast(seed, 4000) for seed in range(3)]
-    views = held([*casts, casts[0]], views=True, first=0).count(np.eye(4))
-    seen = [plain([rays], first=0) > 0 for rays in casts]
+    views = held([*casts, casts[0]], views=True).count(np.eye(4))
+    seen = [plain([rays]) > 0 for rays in casts]
     expected = seen[0] * 2 + seen[1] + seen[2]
     assert np.count_nonzero(views != expected) <= 2
 

@@ -347,7 +347,7 @@ class ScanFeed:
             self._merger.forget_before(frame + self.options.window[0])
             return self._merger
 
-    def free_space(self, spec: GridSpec, step_m: float, views: bool) -> FreeSpace:
+    def free_space(self, spec: GridSpec, step_m: float, once: bool) -> FreeSpace:
         """Return the maps of free space, which are kept from frame to frame."""
         first, last = self.options.window
         corners = _corners(spec)
@@ -363,9 +363,10 @@ class ScanFeed:
             )
 
         with self._lock:
-            if self._free is None or self._free.key != (spec, step_m, views):
+            if self._free is None or self._free.key != (spec, step_m, once):
                 map_T_world = invert(self.pose(int(self.frames[0])))
-                self._free = FreeSpace(spec, step_m, views, map_T_world, corners_of)
+                stride = self.options.stride
+                self._free = FreeSpace(spec, step_m, once, map_T_world, stride, corners_of)
             return self._free
 
     def instant(self, frame: int) -> Instant:

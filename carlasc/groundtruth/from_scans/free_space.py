@@ -21,8 +21,9 @@ class FreeSpace:
     Args:
         spec: the grids.
         step_m: distance between two samples of a ray, metres.
-        views: count each scan once per voxel, instead of all samples.
+        once: count each scan once per voxel, instead of all samples.
         map_T_world: (4, 4), which fixes the cells of the static scene.
+        stride: frames share scans with every `stride`-th one.
         corners_of: returns the corners of the grids that a scan may be merged into, within some
             seconds, (N, 3) metres, world.
     """
@@ -31,49 +32,57 @@ class FreeSpace:
         self,
         spec: GridSpec,
         step_m: float,
-        views: bool,
+        once: bool,
         map_T_world: Transform,
+        stride: int,
         corners_of: Callable[[int, float], FloatArray],
     ) -> None:
-        self.key = spec, step_m, views
-        self._map_T_world, self._corners_of = map_T_world, corners_of
-        self._static, self._recent = FreeMap(*self.key), FreeMap(spec, step_m, first=0)
-        self._views = FreeMap(spec, step_m, views=True, first=0)
-        self._bodies = dict[int, FreeMap]()
+        self.key = spec, step_m, once
+        self._map_T_world, self._stride, self._corners_of = map_T_world, stride, corners_of
+        # by the frames that share it, and what is in it: an actor has its number
+        self._maps = dict[tuple[int, str | int], FreeMap]()
         self._lock = threading.Lock()  # an executor may be of threads
 
     def of_scene(self, merger: Merger, now: Instant, window: Collection[int]) -> Uint32Array:
         """Return (V,) the free samples of the scans of a window in each voxel, or the scans."""
-        return self._count(self._static, merger, now, window)
+        return self._count("scene", merger, now, window)
 
     def views(self, merger: Merger, now: Instant, window: Collection[int]) -> Uint32Array:
-        """Return (V,) the number of scans of a window that saw each voxel."""
-        return self._count(self._views, merger, now, window)
+        """Return (V,) the number of scans of a window whose rays passed through each voxel."""
+        return self._count("views", merger, now, window)
 
     def is_seen(
         self, merger: Merger, now: Instant, recent: Collection[int], voxels: IntArray
     ) -> BoolArray:
-        """Return (M,) bool: which of some voxels recent scans saw."""
-        return self._count(self._recent, merger, now, recent, voxels) > 0
+        """Return (M,) bool: which of some voxels rays of recent scans passed through."""
+        return self._count("recent", merger, now, recent, voxels) > 0
 
     def _count(
         self,
-        cells: FreeMap,
+        kind: str,
         merger: Merger,
         now: Instant,
         window: Collection[int],
         voxels: IntArray | None = None,
     ) -> Uint32Array:
         def cast_of(frame: int) -> Cast:
-            within_s = RECENT_S if cells is self._recent else math.inf
+            within_s = RECENT_S if kind == "recent" else math.inf
             corners = transform_points(self._map_T_world, self._corners_of(frame, within_s))
             return merger.scan_of(frame).cast(
                 self._map_T_world, corners.min(axis=0), corners.max(axis=0)
             )
 
         with self._lock:
+            cells = self._map_of(kind, now)
             cells.hold(window, cast_of)
             return cells.count(self._map_T_world @ now.world_T_grid, voxels)
+
+    def _map_of(self, kind: str | int, now: Instant) -> FreeMap:
+        key, (spec, step_m, once) = (now.frame % self._stride, kind), self.key
+        if key not in self._maps:
+            once = kind == "views" or (once and kind != "recent")
+            self._maps[key] = FreeMap(spec, step_m, once, fine=isinstance(kind, int))
+        return self._maps[key]
 
     def in_bodies(
         self,
@@ -95,12 +104,13 @@ class FreeSpace:
             voxels = np.flatnonzero(regions.of_voxel == region)
             map_T_grid = (MIRROR if mirror else np.eye(4)) @ invert(pose) @ now.world_T_grid
             with self._lock:
-                cells = self._bodies.setdefault(number, FreeMap(*self.key, fine=True))
+                cells = self._map_of(number, now)
                 cells.hold(casts, casts.__getitem__)
                 free[voxels] += cells.count(map_T_grid, voxels)
 
     def forget_others(self, actors: Collection[int]) -> None:
         """Clear the maps of all other actors."""
         with self._lock:
-            for number in [number for number in self._bodies if number not in actors]:
-                del self._bodies[number]
+            for key in [key for key in self._maps if key[1] not in actors]:
+                if isinstance(key[1], int):
+                    del self._maps[key]

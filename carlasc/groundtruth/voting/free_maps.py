@@ -80,25 +80,17 @@ class FreeMap:
         spec: the grids that take their free space from the map.
         step_m: distance between two samples of a ray, metres.
         views: count the scans that saw each voxel, instead of samples in cells.
-        first: number of the first sample on a ray, counted from its point; 0: the point itself.
         fine: make the cells as small in x and y as in z, for small things.
     """
 
     def __init__(
-        self,
-        spec: GridSpec,
-        step_m: float,
-        views: bool = False,
-        *,
-        first: int = 1,
-        fine: bool = False,
+        self, spec: GridSpec, step_m: float, views: bool = False, *, fine: bool = False
     ) -> None:
         x, y, z = spec.voxel_size.tolist()
         # a cylindrical voxel is as wide as deep at some radius
         size = (x, x if spec.coordinates == "cylindrical" else y, z)
         parts = [min(max(round(edge / _CELL_M), 2), _MOST) for edge in size]
-        self.spec, self.views, self._stamp = spec, views, 0
-        self._samples = float(first), step_m
+        self.spec, self.views, self._step_m, self._stamp = spec, views, step_m, 0
         self._parts = (1, 1, 1) if views else (*(parts[:2] if fine else (2, 2)), parts[2])
         self._cell = np.array(size) / self._parts
         self._margin_m = np.linalg.norm(size)  # a voxel that touches a region is counted whole
@@ -107,12 +99,10 @@ class FreeMap:
 
     def _clear(self) -> None:
         self._held.clear()
-        none = np.empty((0, _EDGE**3), np.int32)
-        slots = np.empty((0, 0, 0), np.int32)
-        left = np.zeros(1, np.int64)
-        self._blocks = _Blocks(
-            np.zeros(3, np.int64), slots, none[:, 0].copy(), left, none, none.copy()
-        )
+        slots, unused = np.empty((0, 0, 0), np.int32), np.empty(0, np.int32)
+        counts, stamps = (np.empty((0, _EDGE**3), np.int32) for _ in range(2))
+        origin, left = np.zeros(3, np.int64), np.zeros(1, np.int64)
+        self._blocks = _Blocks(origin, slots, unused, left, counts, stamps)
 
     def hold(self, scans: Collection[int], cast_of: Callable[[int], Cast]) -> None:
         """Add and remove scans, so that the map has the rays of some scans and no others.
@@ -130,13 +120,11 @@ class FreeMap:
         for scan in scans:
             if scan not in self._held:
                 cast = cast_of(scan)
-                lower = (
-                    np.floor((cast.lower - self._margin_m) / self._cell).astype(np.int64) >> _BITS
+                lower, upper = (
+                    np.floor(corner / self._cell).astype(np.int64) >> _BITS
+                    for corner in (cast.lower - self._margin_m, cast.upper + self._margin_m)
                 )
-                upper = (
-                    np.floor((cast.upper + self._margin_m) / self._cell).astype(np.int64) >> _BITS
-                ) + 1
-                upper = np.maximum(upper, lower)  # a region may be empty
+                upper = np.maximum(upper + 1, lower)  # a region may be empty
                 try:
                     self._make_room(lower, upper)
                     self._trace(cast, lower, upper, 1)
@@ -156,14 +144,11 @@ class FreeMap:
         )
         region = Cells(False, size, low, high, tuple(self._cell.tolist()))
         numbers = np.array([sign, self._stamp, *lower - self._blocks.first], np.int32)
-        ray = 0
-        while True:
-            ray = _trace(
-                points, cast.ends, places, ray, region, self._samples, numbers, self._blocks
-            )
-            if ray == len(cast.points):
-                return
-            self._grow()
+        ray, step_m = 0, self._step_m
+        while ray < len(cast.points):
+            ray = _trace(points, cast.ends, places, ray, region, step_m, numbers, self._blocks)
+            if ray < len(cast.points):
+                self._grow()
 
     def _grow(self) -> None:
         """Make room for more blocks."""
@@ -222,7 +207,7 @@ def _trace(
     poses: FloatArray,
     ray: int,
     region: Cells,
-    samples: tuple[float, float],
+    step_m: float,
     numbers: Int32Array,
     blocks: _Blocks,
 ) -> int:
@@ -235,7 +220,7 @@ def _trace(
         poses: (K, 12) map_T_place of the origins.
         ray: the first ray.
         region: the cells of the region, of whole blocks.
-        samples: number of the first sample on a ray, and the distance between two, metres.
+        step_m: distance between two samples, metres.
         numbers: 1 or -1, and a number of this call, which the cells that it changes get if views
             are counted; then (3,) the first block of the region, counted from that of the map.
         blocks: the blocks.
@@ -251,7 +236,7 @@ def _trace(
         view = view_from(pose, region)
         while ray < ends[place]:
             count = min(BLOCK, ends[place] - ray)
-            clip(points[3 * ray : 3 * (ray + count)], labels[:count], *samples, view, rays)
+            clip(points[3 * ray : 3 * (ray + count)], labels[:count], step_m, view, rays)
             for i in range(count):
                 x, y, z, step, last = rays.x[i], rays.y[i], rays.z[i], rays.first[i], rays.last[i]
                 dx, dy, dz = rays.dx[i], rays.dy[i], rays.dz[i]

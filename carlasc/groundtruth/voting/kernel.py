@@ -295,7 +295,7 @@ def vote(cast: Voters, cells: Cells, free_step_m: float, voter: int, tally: Tall
         while begin < ends[place]:
             end = min(begin + BLOCK, ends[place])
             corner, block = points[3 * begin : 3 * end], labels[begin:end]
-            clip(corner, block, 1.0, free_step_m, view, rays)
+            clip(corner, block, free_step_m, view, rays)
             place_points(rays, view, voxels[: end - begin])
             own, likely, now = hits[begin:end], sure[begin:end], voter + place
             vote_occupied(corner, block, own, likely, rays, voxels, pose, cells, now, tally)

@@ -220,13 +220,12 @@ def narrow(
 def clip(
     points: Float32Array,
     labels: Uint16Array,
-    nearest: float,
     free_step_m: float,
     view: GridView,
     rays: RayBlock,
 ) -> None:
     """Transform points (3 n,) with labels (n,) to working coordinates, and find the free samples
-    inside the grid's box, from number `nearest` on.
+    inside the grid's box.
     """
     low, high = view.low, view.high
     for i in range(len(labels)):
@@ -246,7 +245,7 @@ def clip(
         slack = length * 1e-14 + 1e-12
         unsure = (length - whole < slack) | (length - whole > 1.0 - slack) | (norm > view.reach)
 
-        first, last = narrow(nearest, whole, cx, dx, low[0], high[0])
+        first, last = narrow(1.0, whole, cx, dx, low[0], high[0])
         first, last = narrow(first, last, cy, dy, low[1], high[1])
         first, last = narrow(first, last, cz, dz, low[2], high[2])
         first, last = np.ceil(first), np.floor(last)
