@@ -15,8 +15,11 @@ from . import viewing as viewing
 from .captures import record as record
 from .captures import simulate as simulate
 from .converting import LayoutOptions as LayoutOptions
+from .converting import MapExtras as MapExtras
+from .converting import RecordingOptions as RecordingOptions
 from .converting import convert as convert
 from .converting import export as export
+from .converting import map as map
 from .core import Boxes as Boxes
 from .core import ClassTable as ClassTable
 from .core import Grid as Grid
@@ -34,7 +37,6 @@ from .groundtruth import FromCapture as FromCapture
 from .groundtruth import FromGrid as FromGrid
 from .groundtruth import FromScans as FromScans
 from .groundtruth import Voting as Voting
-from .groundtruth import map as map
 from .groundtruth import regrid as regrid
 from .inspection import CardDetails as CardDetails
 from .inspection import audit as audit

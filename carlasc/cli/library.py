@@ -59,7 +59,9 @@ TABLE = {
     "carlasc.convert": Shown(hidden="sequences"),
     "carlasc.evaluate": Shown(hidden="convention name"),
     "carlasc.export": Shown(hidden="sequences"),
-    "carlasc.map": Shown(files="mesh distance", renamed={"cell_m": "--cell"}),
+    "carlasc.map": Shown(renamed={"cell_m": "--cell"}),
+    "carlasc.MapExtras": Shown(files="mesh distance"),
+    "carlasc.RecordingOptions": Shown("Recordings", hidden="options", files="keep"),
     "carlasc.motion.MotionOptions": Shown(
         "Scans merged over time", hidden="min_speed_m_s", renamed={"source": "--motion"}
     ),

@@ -3,27 +3,39 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 from carlasc.cli.common import (
     Json,
+    as_typed,
     echo,
     file_argument,
     place_argument,
     print_json,
+    print_warnings,
+    report_failures,
 )
-from carlasc.cli.flags import WorkFlags
+from carlasc.cli.flags import DeclaredOptions, WorkFlags
 from carlasc.cli.grid_flags import MotionGiven, PosesGiven
 from carlasc.cli.library import Given, Library
 from carlasc.errors import count
 
+DECLARED_BY: Final = "converter"
+"""What declares options of this command, if its arguments name one."""
+
 
 def map(
     *,
+    declared: DeclaredOptions,
+    recording: Annotated[Given, Library("carlasc.RecordingOptions")],
     poses: PosesGiven,
     run: WorkFlags,
     source: Annotated[
-        str, place_argument("A sequence: its folder, a zip, a packed store, or a URL.")
+        str,
+        place_argument(
+            "A sequence: its folder, a zip, a packed store, or a URL; or a recording: a bag, or a "
+            "folder of scans."
+        ),
     ],
     out: Annotated[
         Path | None,
@@ -33,6 +45,7 @@ def map(
         ),
     ] = None,
     options: Annotated[Given, Library("carlasc.map")],
+    extras: Annotated[Given, Library("carlasc.MapExtras")],
     motion: MotionGiven,
     json: Json = False,
 ) -> None:
@@ -40,12 +53,23 @@ def map(
     a mesh, or for OctoMap.
     """
     with run.spread("Mapping", "scans") as spread:
-        result = options.make(source, out, motion=motion.make(), poses=poses.make(), run=spread)
+        result = options.make(
+            source,
+            out,
+            extras=extras.make(),
+            recording=recording.make(options=declared.values),
+            motion=motion.make(),
+            poses=poses.make(),
+            run=spread,
+        )
+    failures = [(failure.frame, failure.message) for failure in result.failures]
     if json:
         print_json(result)
+        report_failures(failures, result.frames + len(failures))
         return
+    print_warnings(result.findings)
     for note in result.notes:
-        echo(f"note: {note}")
+        echo(as_typed(f"note: {note}"))
     for name in result.files:
         echo(name)
     what, of = (
@@ -55,7 +79,8 @@ def map(
     )
     bodies = (
         f", and {count(result.actors, 'actor')} in files of their own"
-        if "actors" in options.values
+        if "actors" in extras.values
         else ""
     )
     echo(f"{result.points:,} {what} {of}{bodies}, in {result.elapsed_s:.1f} s")
+    report_failures(failures, result.frames + len(failures))

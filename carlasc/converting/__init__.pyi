@@ -8,6 +8,10 @@ from .exporter import SequenceExporter as SequenceExporter
 from .exporter import SequenceFile as SequenceFile
 from .exporting import ExportResult as ExportResult
 from .exporting import export as export
+from .mapping import MapExtras as MapExtras
+from .mapping import MapResult as MapResult
+from .mapping import RecordingOptions as RecordingOptions
+from .mapping import map as map
 from .plans import SplitName as SplitName
 from .previewing import RecordingPreview as RecordingPreview
 from .previewing import preview as preview

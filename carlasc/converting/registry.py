@@ -120,10 +120,7 @@ def find_recordings(converter: Converter) -> list[Recording]:
     try:
         return converter.sequences()
     except MissingDataError as error:
-        others = [
-            name for name in converter_names() if _finds(name, type(converter), converter.source)
-        ]
-        if others:
+        if others := readers_of(converter.source, other_than=type(converter)):
             commands = " or ".join(f"`carlasc convert {name}`" for name in others)
             error.advice = f"use {commands}, which can read this folder"
         elif _is_in_layout(converter.source):
@@ -133,6 +130,11 @@ def find_recordings(converter: Converter) -> list[Recording]:
         raise
 
 
+def readers_of(source: Path, *, other_than: type[Converter] | None = None) -> list[str]:
+    """Return the names of the installed converters that find recordings in a place."""
+    return [name for name in converter_names() if _finds(name, other_than, source)]
+
+
 def _is_in_layout(source: Path) -> bool:
     try:
         return bool(as_source(source).sequences())
@@ -140,7 +142,7 @@ def _is_in_layout(source: Path) -> bool:
         return False
 
 
-def _finds(name: str, other_than: type[Converter], source: Path) -> bool:
+def _finds(name: str, other_than: type[Converter] | None, source: Path) -> bool:
     """Return whether an installed converter finds recordings in a place."""
     try:
         kind = load_converter(name)

@@ -163,7 +163,7 @@ def convert(
     if isinstance(grids, GridOptions) and isinstance(grids.observe, FromScans):
         for plan in plans:
             plan.max_range_m = grids.observe.max_range_m
-    states = None if compare == "never" else _source_states(root, found, options)
+    states = None if compare == "never" else source_states(root, found, options)
     records = []
     for plan in plans:
         own = None if states is None else states[None] | states.get(plan.recording.location, {})
@@ -286,7 +286,7 @@ class _ConvertedFrom:
             MadeFrom(combined(sorted(own.items())), own, frames).write(self.plan.writer, _RECORD)
 
 
-def _source_states(
+def source_states(
     root: Path, recordings: Series[Recording], options: Mapping[str, Any] | None
 ) -> dict[str | None, dict[str, str]]:
     """Return the states of the folders of a data set, and of files that options name, by the

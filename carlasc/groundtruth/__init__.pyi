@@ -1,6 +1,4 @@
 from .from_grid import resample as resample
-from .maps.mapping import MapResult as MapResult
-from .maps.mapping import map as map
 from .options import Complete as Complete
 from .options import Dynamic as Dynamic
 from .options import FromCapture as FromCapture

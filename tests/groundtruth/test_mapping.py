@@ -11,7 +11,7 @@ from helpers.scenes.passing_car import CAR, SPEED_M_S, scan, sensor_pose, write_
 from numpy.testing import assert_allclose, assert_array_equal
 
 import carlasc
-from carlasc import GridSpec, Run
+from carlasc import GridSpec, MapExtras, Run
 from carlasc.core.geometry import relative_to, transform_points
 from carlasc.core.grids import mirror_voxels
 from carlasc.core.tables import CARLA
@@ -46,7 +46,8 @@ def drive(tmp_path_factory):
 
 def make(drive, out, **options):
     given = {"motion": NONE, "poses": GIVEN, "run": ALONE, "cell_m": 0.1} | options
-    return carlasc.map(drive, out, **given)
+    extras = MapExtras(**{k: given.pop(k) for k in ("actors", "mesh", "distance") if k in given})
+    return carlasc.map(drive, out, extras=extras, **given)
 
 
 def world_points(frame):

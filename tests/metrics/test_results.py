@@ -63,7 +63,9 @@ def test_95_percent_of_intervals_hold_a_difference_over_few_seeds_and_drives():
     assert 930 <= held <= 970
 
 
-@pytest.mark.parametrize(("degrees", "bound"), [(1, 12.706), (2, 4.303), (4.5, 2.659), (1e9, 1.962)])
+@pytest.mark.parametrize(
+    ("degrees", "bound"), [(1, 12.706), (2, 4.303), (4.5, 2.659), (1e9, 1.962)]
+)
 def test_bounds_are_those_of_the_tables_of_student(degrees, bound):
     assert interval_of(3.0, (1.0, degrees)).high == pytest.approx(3 + bound, abs=2e-3)
 

@@ -1,25 +1,21 @@
-"""`carlasc.map`: a map of the static points of a drive, or of a grid, and the bodies of the actors
-of a drive.
-"""
+"""The map of the static points of a drive, or of a grid, and the bodies of actors."""
 
 from __future__ import annotations
 
-import math
 import shutil
-import time
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 
 from carlasc.core.arrays import AnyArray, FloatArray, IntArray
-from carlasc.core.frames import FrameRange, Frames
+from carlasc.core.frames import FrameRange
 from carlasc.core.geometry import invert, mirror_poses, transform_points
 from carlasc.core.grids import GridSpec, mirror_voxels
-from carlasc.errors import ArgumentError, MissingDataError, check_types
+from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.groundtruth.from_scans.feed import ScanFeed, WithoutScans
 from carlasc.groundtruth.from_scans.merging import Merger
 from carlasc.groundtruth.from_scans.sequences import ScanSequence, scan_sequences
@@ -40,134 +36,47 @@ from carlasc.motion.options import MotionOptions, PoseOptions
 from carlasc.motion.tracks import MovingActors
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run, StepCounter
-from carlasc.storage import as_source, layout
-from carlasc.storage.derived_copies import check_complete
-from carlasc.storage.files import AnyPath, to_json, write_atomic, writing
-from carlasc.storage.folder import FolderWriter
-from carlasc.storage.inputs import MadeFrom, combined, sequence_states
-from carlasc.storage.protocol import Sequence, Source
-
-_LEAST_CELL_M = 0.001  # smaller cells are finer than float32 positions
+from carlasc.storage import layout
+from carlasc.storage.files import to_json, write_atomic, writing
+from carlasc.storage.protocol import Source
 
 
-@dataclass(frozen=True)
-class MapResult:
-    """The result of `map`.
+class MapContent(NamedTuple):
+    """What was written of a map.
 
     Attributes:
-        files: the files, and the folder of actors.
         points: number of points, or of occupied voxels.
         frames: number of scans; 1 for a grid.
         actors: number of actors whose bodies were written.
         notes: remarks on the results, one line each.
-        elapsed_s: duration, in seconds.
     """
 
-    files: tuple[str, ...]
     points: int
     frames: int
     actors: int
     notes: tuple[str, ...]
-    elapsed_s: float
 
 
-def map(
-    source: AnyPath | Source,
-    out: AnyPath | None = None,
-    *,
-    cell_m: float = 0.05,
-    frames: Frames = None,
-    grid: str | None = None,
-    actors: bool = False,
-    mesh: AnyPath | None = None,
-    distance: AnyPath | None = None,
-    motion: MotionOptions = MotionOptions(),  # noqa: B008 (frozen)
-    poses: PoseOptions = PoseOptions(),  # noqa: B008 (frozen)
-    overwrite: bool = False,
-    run: Run = Run(),  # noqa: B008 (frozen)
-) -> MapResult:
-    """Write a map of a drive: the static points of its scans in one frame, one point per cell,
-    without moving points.
-
-    The frame is that of the drive's poses, in right-handed axes: x ahead, y to the left, z up, at
-    the first scan. Each point is the mean of the points in its cell. Its class has the most votes,
-    one vote per scan; `seen` is the number of scans; `confidence` is the share of the votes for the
-    class with one more vote against it: 0.5 for a cell that one scan saw. Moving points are found
-    as in `regrid`. With `grid`, the map is a grid of one frame instead, in the frame of its sensor.
-
-    Args:
-        source: a data set with one sequence: anything that `carlasc.open` takes, or a source.
-        out: the file of the map: .ply, .pcd, .las or .npz (points), or .bt (OctoMap). None: only
-            the files `mesh` and `distance`.
-        cell_m: size of a cell, in metres: one point is written per cell. A grid has its own cells.
-        frames: range of frame numbers; None for all. Moving actors are searched for in a few more
-            seconds. With `grid`, one frame.
-        grid: make the map from this grid of one frame, instead of the scans.
-        actors: also write the body of each moving actor, in its own frame, to the folder
-            OUT_actors, and their poses to actors.json.
-        mesh: file of the surface of the occupied cells, with classes as colours: .ply or .glb.
-        distance: with `grid`: .npz file of the distance of each voxel from the surface.
-        motion: how moving points are found.
-        poses: where poses come from. Missing poses are estimated from the scans, unless
-            `PoseOptions("file")` is given.
-        overwrite: replace existing files.
-        run: how the work is spread. Steps of progress are scans.
-
-    Returns:
-        The files that were written.
-
-    Raises:
-        ArgumentError: an ending that is not known, cells that OctoMap cannot hold, or an argument
-            that does not fit.
-        MissingDataError: there is no scan, no pose, no such grid, or nothing static.
-        ConflictError: a file exists.
-        CompleteError: the files of this call exist.
-        FormatError: a scan, poses or times are not valid.
-        DependencyError: a file needs a package that is not installed, or poses have to be
-            estimated, and kiss-icp is not installed.
-        StorageError: a file cannot be written.
+def write_map(
+    source: Source,
+    files: MapFiles,
+    frames: FrameRange,
+    cell_m: float,
+    motion: MotionOptions,
+    poses: PoseOptions,
+    run: Run,
+) -> MapContent:
+    """Write the map of the one drive of a source. For the arguments and errors, see
+    `carlasc.map`.
     """
-    check_types(map, locals())
-    began = time.perf_counter()
-    if not (math.isfinite(cell_m) and cell_m >= _LEAST_CELL_M):
-        raise ArgumentError(
-            "cell_m", expected=f"{_LEAST_CELL_M:g} metres or more", found=str(cell_m)
-        )
-    if run.part.count > 1:
-        raise ArgumentError("part", expected="none, as a map is one file", found=str(run.part))
-    files = MapFiles.of(out, mesh, distance, actors, grid)
-    opened, wanted = as_source(source), FrameRange.of(frames)
-    first, settings = files.all[0], (cell_m, str(wanted), grid, [str(path) for path in files.all])
-    states = sequence_states(opened, *([f"{grid}/labels", f"{grid}/counts"] if grid else []))
-    record = MadeFrom(combined(settings, motion, poses, sorted(states.items())))
-    keeper, kept = FolderWriter(first.parent), f"map-{first.name}"
-    if not overwrite and all(path.exists() for path in files.all):
-        check_complete(first, MadeFrom.read(keeper, kept) == record)
-    files.check(overwrite)
-    count, bodies, notes = (
-        1,
-        0,
-        tuple[str, ...](),
-    )
-    if grid is not None:
-        points = write_grid(opened, grid, wanted, files)
-    else:
-        options = FromScans(window=(0, 0), motion=motion, poses=poses)
-        with files.folder() as folder:
-            drive = DriveMap.of(opened, wanted, options, GrowingCells(Path(folder), cell_m))
-            drive.fill(run, actors)
-            points, count, notes = drive.write(files), len(drive.frames), drive.notes()
-            if files.actors is not None and files.out is not None:
-                bodies = drive.write_actors(files.actors, files.out.suffix.lower())
-    record.write(keeper, kept)
-    return MapResult(
-        tuple(str(path) for path in files.all),
-        points,
-        count,
-        bodies,
-        notes,
-        time.perf_counter() - began,
-    )
+    options = FromScans(window=(0, 0), motion=motion, poses=poses)
+    with files.folder() as folder:
+        drive = DriveMap.of(source, frames, options, GrowingCells(Path(folder), cell_m))
+        drive.fill(run, files.actors is not None)
+        points, bodies = drive.write(files), 0
+        if files.actors is not None and files.out is not None:
+            bodies = drive.write_actors(files.actors, files.out.suffix.lower())
+    return MapContent(points, len(drive.frames), bodies, drive.notes())
 
 
 _BLOCK = 10  # number of scans that a worker sums
@@ -196,17 +105,13 @@ class DriveMap:
         Scans far from the chosen frames are hidden: their motion does not matter.
         """
         plan = GridPlan(GridSpec.published(), "map", options, Voting(), frames)
-        sequence = only(
-            [
-                one.sequence
-                for one in scan_sequences(source, plan, options)
-                if isinstance(one, ScanSequence)
-            ]
-        )
+        found = scan_sequences(source, plan, options)
+        having = [one.sequence for one in found if isinstance(one, ScanSequence)]
+        sequence = only(having, [one.path or one.location for one in having])
         known = sequence.frames("points")
         chosen = choose_frames(frames, known, sequence.location)
-        around = round(HORIZON_S / layout.FRAME_PERIOD_S)
-        hidden = known[(known < chosen[0] - around) | (known > chosen[-1] + around)].tolist()
+        near = with_neighbours(FrameRange(chosen[0], chosen[-1] + 1))
+        hidden = [int(frame) for frame in known if frame not in near]
         view = WithoutScans(sequence, hidden) if hidden else sequence
         return cls(ScanSequence(view, plan, options), chosen, cells)
 
@@ -343,8 +248,8 @@ class _AddScans:
             yield rows_of_scan(right, labels[points], sure, group, self.cell_m)
 
 
-def write_grid(source: Source, name: str, frames: FrameRange, files: MapFiles) -> int:
-    """Write the occupied voxels of a grid, in right-handed axes, and return their number.
+def write_grid(source: Source, name: str, frames: FrameRange, files: MapFiles) -> MapContent:
+    """Write the occupied voxels of a grid of one frame, in right-handed axes.
 
     Raises:
         MissingDataError: there is no such grid, or nothing in it is occupied.
@@ -356,7 +261,7 @@ def write_grid(source: Source, name: str, frames: FrameRange, files: MapFiles) -
         raise MissingDataError(
             source.location, expected=f"the grid {name}", found=", ".join(names) or "no grid"
         )
-    sequence = only(having)
+    sequence = only(having, [one.path or one.location for one in having])
     where = f"{sequence.location}/{name}"
     chosen = choose_frames(frames, sequence.frames(f"{name}/labels"), where)
     if len(chosen) > 1:
@@ -386,21 +291,33 @@ def write_grid(source: Source, name: str, frames: FrameRange, files: MapFiles) -
     files.write(pieces, lambda: MapCells(index, labels, lower, size))
     if files.distance is not None:
         write_distances(files.distance, given)
-    return len(points)
+    return MapContent(len(points), 1, 0, ())
 
 
-def only(sequences: list[Sequence]) -> Sequence:
-    """Return the one sequence.
+def with_neighbours(frames: FrameRange) -> FrameRange:
+    """Return a range with the frames around it that tell what moves in it."""
+    around = round(HORIZON_S / layout.FRAME_PERIOD_S)
+    start, stop = frames.start, frames.stop
+    return FrameRange(
+        None if start is None else max(start - around, 0), None if stop is None else stop + around
+    )
+
+
+T = TypeVar("T")
+
+
+def only(found: list[T], names: list[str]) -> T:
+    """Return the one sequence, or recording.
 
     Raises:
         ArgumentError: there are several.
     """
-    if len(sequences) != 1:
-        few = ", ".join(one.path or one.location for one in sequences[:3])
+    if len(found) != 1:
+        few = ", ".join(names[:3])
         raise ArgumentError(
             "source",
             expected="one sequence, as a map has one frame",
-            found=f"{len(sequences)} ({few}{', ...' if len(sequences) > 3 else ''})",
+            found=f"{len(found)} ({few}{', ...' if len(found) > 3 else ''})",
             advice="give the folder of one",
         )
-    return sequences[0]
+    return found[0]

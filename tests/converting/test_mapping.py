@@ -1,0 +1,130 @@
+"""`carlasc map` of recordings: they are converted into a hidden folder, and mapped from there."""
+
+from dataclasses import replace
+
+import pytest
+from helpers.converters.bags import Messages, drive_messages, write_bag
+from helpers.errors import raises
+
+import carlasc
+from carlasc import RecordingOptions, Run
+from carlasc.converting import mapping
+from carlasc.errors import (
+    ArgumentError,
+    CompleteError,
+    ConflictError,
+    DependencyError,
+    FormatError,
+    MissingDataError,
+)
+from carlasc.motion import MotionOptions, PoseOptions
+from carlasc.testing import SCENES, SimulatedDrive
+from carlasc.testing.scenes import write_scans
+
+DRIVE = replace(SCENES["walking-robot"], frames=5, channels=8, columns=90)
+GIVEN = {
+    "cell_m": 0.2,
+    "motion": MotionOptions("none"),
+    "poses": PoseOptions("file", "never", force=True),  # so few points hardly overlap
+    "run": Run(workers=1),
+}
+
+
+pytest.importorskip("rosbags", reason="needs carlasc[bags]")
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("recording")
+    write_scans(DRIVE, folder)
+    return folder
+
+
+def make(recording, out, **options):
+    of_scans = {"options": {"pose_file": str(recording / "poses.txt")}, "converter": "scans"}
+    read = RecordingOptions(**of_scans, **options)
+    return carlasc.map(recording / "scans", out, recording=read, **GIVEN)
+
+
+def test_the_map_of_a_recording_is_that_of_the_converted_one(recording, tmp_path):
+    result = make(recording, tmp_path / "a.ply")
+    kept = make(recording, tmp_path / "b.ply", keep=tmp_path / "kept")
+    again = carlasc.map(tmp_path / "kept", tmp_path / "c.ply", **GIVEN)
+    a, b, c = ((tmp_path / f"{name}.ply").read_bytes() for name in "abc")
+    assert a == b == c
+    assert result.frames == kept.frames == again.frames == DRIVE.frames
+    assert result.points == again.points > 100 and result.failures == ()
+    assert [path.name for path in (tmp_path / ".carlasc").iterdir() if path.is_dir()] == []
+    assert not any(".carlasc" in note for note in result.notes)
+    with pytest.raises(CompleteError):
+        make(recording, tmp_path / "a.ply")
+
+
+def test_an_interrupted_map_goes_on_from_what_was_converted(recording, tmp_path, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(mapping, "write_map", stop)
+        with pytest.raises(KeyboardInterrupt):
+            make(recording, tmp_path / "a.ply")
+    assert not (tmp_path / "a.ply").exists()
+    made = []
+    convert = mapping.convert
+    monkeypatch.setattr(
+        mapping,
+        "convert",
+        lambda *args, **options: made.append(convert(*args, **options)) or made[-1],
+    )
+    make(recording, tmp_path / "a.ply")
+    assert (made[0].made, made[0].skipped) == (0, DRIVE.frames)
+    make(recording, tmp_path / "b.ply")
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_a_bad_scan_is_named_and_the_others_are_mapped(recording, tmp_path):
+    copy = tmp_path / "scans"
+    copy.mkdir()
+    for place, path in enumerate(sorted((recording / "scans").iterdir())):
+        data = path.read_bytes()
+        (copy / path.name).write_bytes(data[:200] if place == 3 else data)
+    read = RecordingOptions("scans", options={"pose_file": str(recording / "poses.txt")})
+    result = carlasc.map(copy, tmp_path / "a.pcd", recording=read, **GIVEN)
+    assert result.frames == DRIVE.frames - 1
+    assert [failure.frame for failure in result.failures] == [3]
+
+
+def test_the_reader_of_a_recording_is_found(recording, tmp_path):
+    poses = PoseOptions("file", "never")
+    with pytest.raises(MissingDataError) as error:  # bare scans, and poses are asked for
+        carlasc.map(recording / "scans", tmp_path / "a.ply", poses=poses, run=Run(workers=1))
+    assert "poses" in str(error.value)
+
+
+@pytest.mark.parametrize("kind", ["empty", "file", "missing"])
+def test_places_that_nothing_can_read_are_refused(tmp_path, kind):
+    place = tmp_path / "place"
+    if kind == "empty":
+        place.mkdir()
+    elif kind == "file":
+        place.write_text("no bag")
+    with pytest.raises((MissingDataError, FormatError, DependencyError)) as error:
+        carlasc.map(place, tmp_path / "a.ply", **GIVEN)
+    assert str(place) in str(error.value)
+    assert not (tmp_path / ".carlasc").exists()
+
+
+def test_what_would_be_read_again_is_refused(recording, tmp_path):
+    with pytest.raises(ConflictError):
+        make(recording, recording / "scans" / "clean.pcd")
+    store = Messages("mcap")
+    for name in "ab":
+        (tmp_path / "two" / name).mkdir(parents=True)
+        messages = drive_messages(store, SimulatedDrive(2, channels=4, columns=20), "odometry")
+        write_bag(tmp_path / "two" / name, "mcap", messages, store=store)
+    with raises(ArgumentError, where="source", found="2 "):
+        carlasc.map(tmp_path / "two", tmp_path / "a.ply", **GIVEN)
+    make(recording, tmp_path / "b.ply", keep=tmp_path / "kept")
+    with raises(ArgumentError, where="keep"):
+        other = RecordingOptions(keep=tmp_path / "other")
+        carlasc.map(tmp_path / "kept", tmp_path / "a.ply", recording=other, **GIVEN)
