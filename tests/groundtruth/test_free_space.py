@@ -7,13 +7,14 @@ import pytest
 from helpers.scenes import passing_car
 
 import carlasc
-from carlasc import FromScans, GridSpec, Voting
+from carlasc import FromScans, GridSpec, Run, Voting
 from carlasc.core.frames import FrameRange
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
 from carlasc.groundtruth.inputs import GridPlan
+from carlasc.running import Part
 from carlasc.storage import FolderSink
 
 SPEC = passing_car.SPEC.with_size((64, 64, 8))
@@ -140,3 +141,26 @@ def test_other_settings_have_maps_of_their_own(street):
             merge_frame(plan, feed, actors, 20, window),
             merge_frame(plan, alone, actors, 20, window),
         )
+
+
+@pytest.mark.slow
+def test_a_run_makes_the_same_bytes_however_its_frames_are_dealt(street, tmp_path):
+    """Alone, in one process, by two workers with ranges of frames, and in parts."""
+    settings = {"observe": FromScans(window=(-6, 6)), "voting": Voting(keep_evidence=True)}
+
+    def made(name, frames, *runs):
+        for run in runs:
+            carlasc.regrid(
+                street, SPEC, tmp_path / name, frames=frames, name="g", run=run, **settings
+            )
+        grids = tmp_path / name / "cartesian" / "g"
+        return {
+            path.name: path.read_bytes() for path in grids.iterdir() if path.stem.startswith("0000")
+        }
+
+    whole = made("whole", (16, 24), Run(1))
+    assert len(whole) > 16
+    assert made("two", (16, 24), Run(2)) == whole
+    assert made("parts", (16, 24), Run(1, part=Part(2, 2)), Run(1, part=Part(1, 2))) == whole
+    (alone,) = {path[:6] for path in made("alone", (20, 21), Run(1))}
+    assert made("alone", (20, 21), Run(1)).items() <= whole.items() and alone == "000020"
