@@ -26,15 +26,6 @@ def occupied(votes):
     return {(int(r["voxel"]), int(r["label"])): int(r["votes"]) for r in votes.occupied}
 
 
-def test_points_that_do_not_hit_leave_their_rays():
-    one = observation()
-    hits = np.arange(500) % 3 == 0
-    part = tally([observation(hits=hits)])
-    assert (part.free == tally([one]).free).all()
-    only = tally([Observation(one.points[hits], one.labels[hits], one.grid_T_sensor)])
-    assert occupied(part) == occupied(only)
-
-
 def test_every_sample_counts_with_the_rule_ray_as_with_sample():
     observations = [observation(seed) for seed in range(3)]
     ray, sensor, sample = (tally(observations, rule) for rule in ("ray", "sensor", "sample"))
@@ -46,7 +37,7 @@ def test_every_sample_counts_with_the_rule_ray_as_with_sample():
 CYLINDER = GridSpec("cylindrical", (8, 24, 4), (0.0, -np.pi, -2), (8.0, np.pi, 2))
 
 
-def by_class(observations, within=EVERYWHERE):
+def by_class(observations, within=EVERYWHERE, sure=None):
     """Return the points of observations class by class, each observation a voter."""
     for label in range(1, 12):
         yield (
@@ -55,7 +46,7 @@ def by_class(observations, within=EVERYWHERE):
                 ClassPoints(
                     np.ascontiguousarray(one.points[one.labels == label].T),
                     one.grid_T_sensor,
-                    None if one.sure is None else one.sure[one.labels == label],
+                    None if sure is None else sure[one.labels == label],
                 )
                 for one in observations
             ],
@@ -65,11 +56,8 @@ def by_class(observations, within=EVERYWHERE):
 
 @pytest.mark.parametrize("spec", [SPEC, CYLINDER], ids=["cartesian", "cylindrical"])
 @pytest.mark.parametrize("rule", ["sensor", "sample", "ray"])
-@pytest.mark.parametrize("sure", [False, True])
-def test_points_class_by_class_vote_as_the_points_of_observations_do(rule, sure, spec):
-    likely = np.random.default_rng(6).choice([0.25, 0.5, 1.0], 500).astype(np.float32)
-    options = {"sure": likely} if sure else {}
-    observations = [observation(seed, **options) for seed in range(3)]
+def test_points_class_by_class_vote_as_the_points_of_observations_do(rule, spec):
+    observations = [observation(seed) for seed in range(3)]
     whole, points = (Ballot(spec, rule=rule, keep_boxes=spec is SPEC) for _ in range(2))
     for one in observations:
         whole.add(one)
@@ -78,6 +66,15 @@ def test_points_class_by_class_vote_as_the_points_of_observations_do(rule, sure,
     assert (points.occupied == whole.occupied).all() and len(points.occupied) > 500
     assert not points.free.any() and whole.free.any()
     np.testing.assert_array_equal(points.boxes, whole.boxes)
+
+
+def test_the_certainty_of_votes_is_the_sum_of_their_probabilities():
+    one, likely = observation(), np.float32([0.25, 0.5, 1.0])[np.arange(500) % 3]
+    ballot = Ballot(SPEC, rule="ray")
+    ballot.add_points(by_class([one], sure=likely))
+    for row in ballot.votes().occupied:
+        inside = (SPEC.flat_index(one.points) == row["voxel"]) & (one.labels == row["label"])
+        assert (np.count_nonzero(inside), likely[inside].sum()) == (row["votes"], row["sure"])
 
 
 def test_points_of_a_region_vote_in_its_voxels_only():

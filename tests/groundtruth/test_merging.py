@@ -99,11 +99,6 @@ def in_world(one, frame=15):
     return transform_points(sensor_pose(frame) @ one.grid_T_points, one.points.T)
 
 
-def voting(observation):
-    """Return the classes of the points that vote."""
-    return observation.labels[observation.hits].tolist()
-
-
 def test_a_persons_shape_is_used_for_eight_frames_and_a_vehicles_for_all():
     assert PEDESTRIAN in CARLA.deformable and VEHICLE not in CARLA.deformable
     assert len(in_bodies(merger(PEDESTRIAN))) == 16
@@ -140,7 +135,7 @@ def test_rays_that_miss_the_box_are_not_carried():
 
 def test_the_frames_own_rays_are_an_observation():
     merging = merger()
-    assert sorted(voting(merging.own(instant(15)))) == classes(merging, 15)
+    assert sorted(merging.own(instant(15)).labels.tolist()) == classes(merging, 15)
 
 
 @pytest.mark.parametrize(

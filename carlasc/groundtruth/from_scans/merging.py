@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -183,11 +183,6 @@ class PreparedScan:
         """(K,) index after the last ray of each origin."""
         return np.array([rays.part.stop for rays in self.rays])
 
-    def from_places(self) -> dict[str, Any]:
-        """Return arguments of `Observation`: the rays, and the runs of their origins."""
-        ends = None if self.world_T_places.ndim == 2 else self.runs
-        return {"points": self.ends, "sure": self.sure, "ends": ends}
-
     def through(
         self, world_T_box: Transform, lower: FloatArray, upper: FloatArray
     ) -> Iterator[tuple[RaysFromPlace, Transform, Int32Array]]:
@@ -252,12 +247,9 @@ class Merger:
     def own(self, now: Instant) -> Observation:
         """Return the observation by the frame's own scan, whose rays count everywhere."""
         scan = self.scan_of(now.frame)
-        return Observation(
-            labels=self.labels(now.frame),
-            grid_T_sensor=now.grid_T_world @ scan.world_T_places,
-            hits=self._votes(now.frame, own=True),
-            **scan.from_places(),
-        )
+        ends = None if scan.world_T_places.ndim == 2 else scan.runs
+        places = now.grid_T_world @ scan.world_T_places
+        return Observation(scan.ends, self.labels(now.frame), places, ends)
 
     def points(self, now: Instant, window: Iterable[int]) -> Iterator[SeenClass]:
         """Yield the static points of each scan, and all points of the frame's own scan, by class.

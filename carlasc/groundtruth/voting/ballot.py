@@ -61,9 +61,6 @@ class Observation:
             rounding to float32 is part of the rule: see the format page, `docs/format.md#votes`.
         labels: (N,) unsigned integer class ids. Points labelled 0 and their rays do not vote.
         grid_T_sensor: (4, 4) float64, from the sensor's frame to the grid's; or (K, 4, 4).
-        hits: (N,) bool, points that vote for their class; for the other points only the rays vote.
-            None: all points.
-        sure: (N,) float32, probability of the class of each point; None: 1.
         ends: (K,) int64, index after the last point of each voter; None: one voter.
 
     Raises:
@@ -74,8 +71,6 @@ class Observation:
     points: Float32Array
     labels: LabelArray
     grid_T_sensor: Transform
-    hits: BoolArray | None = None
-    sure: Float32Array | None = None
     ends: IntArray | None = None
 
     def __post_init__(self) -> None:
@@ -88,12 +83,6 @@ class Observation:
         if self.labels.dtype.kind != "u":
             raise FormatError(
                 "observation labels", expected="unsigned integers", found=str(self.labels.dtype)
-            )
-        if self.hits is not None and self.hits.shape != self.labels.shape:
-            raise FormatError(
-                "observation hits",
-                expected=f"shape ({len(self.points)},)",
-                found=str(self.hits.shape),
             )
         check_rigid(self.grid_T_sensor, "observation grid_T_sensor")
         poses, ends = np.shape(self.grid_T_sensor)[:-2], self.ends
@@ -249,8 +238,6 @@ class Ballot:
         cast = kernel.Voters(
             _ready(observation.points, np.float32).reshape(-1),
             _ready(observation.labels, np.uint16),
-            _ready(observation.hits, np.bool_),
-            _ready(observation.sure, np.float32),
             np.ascontiguousarray(observation.grid_T_sensor, np.float64)
             .reshape(-1, 16)[:, :12]
             .copy(),
@@ -260,7 +247,6 @@ class Ballot:
         kernel.vote(cast, self._cells, self.free_step_m, voter, self._tally)
         if self._boxes is not None:
             voting = observation.labels > 0
-            voting &= True if observation.hits is None else observation.hits
             for pose, begin, end in zip(cast.poses, [0, *ends], ends, strict=False):
                 points = observation.points[begin:end][voting[begin:end]]
                 self._widen(points.T, as_pose(pose.reshape(3, 4)), *EVERYWHERE)

@@ -71,6 +71,7 @@ def count_hits(
             hits[voxel].votes += 1
             hits[voxel].voters += hits[voxel].last != own
             hits[voxel].last = own
+            # the doubt is summed, not the certainty: it is 0 for labels without probabilities
             if doubts:
                 doubt[voxel] += np.float32(1) - sure[begin + i]
         begin += size

@@ -15,7 +15,6 @@ import numpy as np
 
 from carlasc.core.arrays import (
     AnyArray,
-    BoolArray,
     Float32Array,
     FloatArray,
     Int32Array,
@@ -93,16 +92,12 @@ class Voters(NamedTuple):
         points: (3 N,) float32, metres, x, y, z of each point from the origin of its ray, on the
             axes of the sensor.
         labels: (N,) uint16; points labelled 0 and their rays do not vote.
-        hits: (N,) bool, points that vote for their class; empty: all.
-        sure: (N,) float32, probability of these classes; empty: 1.
         poses: (K, 12) grid_T_place of the origins of rays; each one is a voter.
         ends: (K,) index after the last point of each origin.
     """
 
     points: Float32Array
     labels: Uint16Array
-    hits: BoolArray
-    sure: Float32Array
     poses: FloatArray
     ends: IntArray
 
@@ -133,8 +128,6 @@ def find_candidate(voxel: int, label: int, tally: Tally) -> int:
 def vote_occupied(
     points: Float32Array,
     labels: Uint16Array,
-    hits: BoolArray,
-    sure: Float32Array,
     rays: RayBlock,
     voxels: Int32Array,
     pose: Pose,
@@ -142,16 +135,14 @@ def vote_occupied(
     voter: int,
     tally: Tally,
 ) -> None:
-    """Add the votes of the points of a block for their classes; `hits` chooses points, unless it is
-    empty.
-    """
+    """Add the votes of the points of a block for their classes."""
     # `entry` is the candidate of the pair (last, label) for which the point before voted, and
     # `more` its votes that are not written yet: neighbouring points are often in one voxel.
     # Arrays are taken out of the tuples once: Numba counts a reference each time.
     heads, candidates, states, once = tally.heads, tally.candidates, rays.state, tally.once
-    entry, last, label, more, doubts = 0, NONE, np.uint16(0), 0, len(sure) > 0
+    entry, last, label, more = 0, NONE, np.uint16(0), 0
     for i in range(len(labels)):
-        if states[i] == DROPPED or (len(hits) and not hits[i]):
+        if states[i] == DROPPED:
             continue
         voxel = voxels[i]
         if voxel == DOUBTFUL or states[i] == UNSURE:
@@ -172,9 +163,6 @@ def vote_occupied(
                 candidates[entry].votes += 1
                 candidates[entry].voters += candidates[entry].voter != voter
                 candidates[entry].voter = voter
-        # The doubt is summed, not the certainty: it is 0 for labels without probabilities.
-        if doubts:
-            candidates[entry].doubt += np.float32(1) - sure[i]
     if more:
         candidates[entry].votes += more
 
@@ -285,7 +273,7 @@ def vote(cast: Voters, cells: Cells, free_step_m: float, voter: int, tally: Tall
         voter: number of the first voter.
         tally: the votes so far, with room for N more candidates.
     """
-    points, labels, hits, sure, poses, ends = cast
+    points, labels, poses, ends = cast
     rays, voxels, begin = empty_rays(BLOCK), np.empty(BLOCK, np.int32), 0
     for place in range(len(ends)):
         p = poses[place]
@@ -297,8 +285,7 @@ def vote(cast: Voters, cells: Cells, free_step_m: float, voter: int, tally: Tall
             corner, block = points[3 * begin : 3 * end], labels[begin:end]
             clip(corner, block, free_step_m, view, rays)
             place_points(rays, view, voxels[: end - begin])
-            own, likely, now = hits[begin:end], sure[begin:end], voter + place
-            vote_occupied(corner, block, own, likely, rays, voxels, pose, cells, now, tally)
+            vote_occupied(corner, block, rays, voxels, pose, cells, voter + place, tally)
             vote_free(corner, block, rays, pose, view, cells, free_step_m, tally)
             begin = end
         if tally.once:
