@@ -259,7 +259,7 @@ class Ballot:
         from carlasc.groundtruth.voting import hits
 
         counted = np.zeros(self.spec.num_voxels + 1, hits.HIT_DTYPE)
-        for label, voters, *within in seen:
+        for label, voters, regions, region in seen:
             points = sum(one.points.shape[1] for one in voters)
             hit, used = np.empty(min(points, len(counted)), np.int32), np.zeros(1, np.int64)
             certain = all(one.sure is None for one in voters)
@@ -269,9 +269,9 @@ class Ballot:
                 hits.count_hits(
                     one.points, sure, pose, self._cells, voter, counted, doubt, hit, used
                 )
-                self._widen(one.points, pose, *within)
+                self._widen(one.points, pose, regions, region)
             self._make_room(int(used[0]))
-            hits.add_hits(label, counted, doubt, hit[: used[0]], *within, self._tally)
+            hits.add_hits(label, counted, doubt, hit[: used[0]], regions, region, self._tally)
 
     def _widen(self, points: Float32Array, pose: Pose, regions: Uint16Array, region: int) -> None:
         from carlasc.groundtruth.voting import filled
