@@ -288,6 +288,39 @@ BUILT_IN: dict[str, ClassTable] = {}
 """The class tables of `carlasc.core.TABLES`, by name."""
 
 
+def table_from_json(value: object, where: str) -> ClassTable:
+    """Return the class table that a JSON file names or contains.
+
+    Args:
+        value: the name of a built-in table, or the result of `ClassTable.to_dict`.
+        where: the file, for errors.
+
+    Raises:
+        FormatError: no table has this name, the values are not valid, or a built-in table has the
+            same name and other values.
+    """
+    if not isinstance(value, Mapping):
+        if str(value) not in BUILT_IN:
+            expected = f"one of {', '.join(BUILT_IN)}"
+            raise FormatError(f"{where}: classes", expected=expected, found=repr(str(value)))
+        return BUILT_IN[str(value)]
+    table = ClassTable.from_dict(value, where)
+    known = BUILT_IN.get(table.name, table)
+    if known != table:
+        raise FormatError(
+            f"{where}: classes",
+            expected=f"a name that is not in use, or the table {table.name} of carlasc",
+            found=f"a different table with the name {table.name}",
+            advice="give the table a new name",
+        )
+    return known
+
+
+def table_to_json(table: ClassTable) -> str | dict[str, Any]:
+    """Return a class table for JSON: its name if it is built in, otherwise the whole table."""
+    return table.name if BUILT_IN.get(table.name) == table else table.to_dict()
+
+
 def tables_with(ids: Collection[int], like: ClassTable) -> list[ClassTable]:
     """Return the other built-in tables that have all of the ids, those named after `like` first."""
     tables = [t for t in BUILT_IN.values() if t != like and t.names.keys() >= set(ids)]
