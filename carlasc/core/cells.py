@@ -51,6 +51,13 @@ def as_pose(dst_T_src: Transform) -> Pose:
 
 
 @inlined
+def pose_of(poses: FloatArray, row: int) -> Pose:
+    """Return one of (K, 12) poses as scalars."""
+    p = poses[row]
+    return (p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11])
+
+
+@inlined
 def transform(pose: Pose, x: Real, y: Real, z: Real) -> tuple[Real, Real, Real]:
     """Return R @ p + t, summed from the left."""
     return (

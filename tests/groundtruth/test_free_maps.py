@@ -5,7 +5,8 @@ import pytest
 
 from carlasc.core.geometry import rotation_z, transform_points, translation
 from carlasc.core.grids import GridSpec
-from carlasc.groundtruth.voting.free_maps import Cast, FreeMap
+from carlasc.groundtruth.from_scans.free_space import FreeMap
+from carlasc.groundtruth.from_scans.merging import Cast
 
 SPEC = GridSpec("cartesian", (20, 20, 8), (-4.0, -4.0, -1.6), (4.0, 4.0, 1.6))
 STEP_M = 0.7

@@ -29,7 +29,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan, check_finite, lengths, sorted_by_origin
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.groundtruth.from_scans.free_space import FreeSpace
-from carlasc.groundtruth.from_scans.merging import Instant, Merger, PreparedScan
+from carlasc.groundtruth.from_scans.merging import Cast, Instant, Merger, PreparedScan
 from carlasc.groundtruth.inputs import without_caches
 from carlasc.groundtruth.options import FromScans
 from carlasc.motion import (
@@ -350,23 +350,22 @@ class ScanFeed:
     def free_space(self, spec: GridSpec, step_m: float, once: bool) -> FreeSpace:
         """Return the maps of free space, which are kept from frame to frame."""
         first, last = self.options.window
-        corners = _corners(spec)
+        corners, map_T_world = _corners(spec), invert(self.pose(int(self.frames[0])))
 
-        def corners_of(frame: int, within_s: float) -> FloatArray:
+        def cast_of(frame: int, within_s: float) -> Cast:
             near = self.frames[(self.frames >= frame - last) & (self.frames <= frame - first)]
-            return np.concatenate(
-                [
-                    transform_points(self.pose(other), corners)
-                    for other in near.tolist()
-                    if abs(self.times[other] - self.times[frame]) <= within_s
-                ]
-            )
+            grids = [
+                transform_points(self.pose(other), corners)
+                for other in near.tolist()
+                if abs(self.times[other] - self.times[frame]) <= within_s
+            ]
+            around = transform_points(map_T_world, np.concatenate(grids))
+            return self.read(frame).cast(map_T_world, around.min(axis=0), around.max(axis=0))
 
         with self._lock:
             if self._free is None or self._free.key != (spec, step_m, once):
-                map_T_world = invert(self.pose(int(self.frames[0])))
                 stride = self.options.stride
-                self._free = FreeSpace(spec, step_m, once, map_T_world, stride, corners_of)
+                self._free = FreeSpace(spec, step_m, once, map_T_world, stride, cast_of)
             return self._free
 
     def instant(self, frame: int) -> Instant:

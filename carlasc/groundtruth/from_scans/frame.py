@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +26,7 @@ from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.free_space import FreeSpace
 from carlasc.groundtruth.from_scans.merging import STATIC, BodyRegions, Instant, Merger
 from carlasc.groundtruth.inputs import FrameData, GridPlan
-from carlasc.groundtruth.voting.ballot import EVERYWHERE, Ballot, Observation, SeenClass, Votes
+from carlasc.groundtruth.voting.ballot import Ballot, Observation, SeenClass, Votes
 from carlasc.groundtruth.voting.certainty import (
     UNKNOWN,
     ClassConsensus,
@@ -82,16 +81,15 @@ def merge_frame(
     space = feed.free_space(plan.spec, plan.voting.free_step_m, plan.rule == "sensor")
     space.forget_others(merger.actors.tracks)
     steps = _FrameSteps(plan, feed, merger, now, window, regions, space)
-    own = steps.vote([merger.own(now)] if frame in window else [])
+    own = steps.vote([], [merger.own(now)] if frame in window else [])
     own_free, seen_now = own.free[steps.in_body], own.seen()
     del own  # frees memory for the next ballots
     # The static scene votes in all voxels, and each moving actor in the voxels of its body.
-    ballot = steps.vote(
-        points=chain(merger.points(now, window), merger.in_bodies(now, window, regions))
-    )
-    ballot.free[:] = space.of_scene(merger, now, window)
+    bodies = list(merger.bodies(now, window, regions))
+    ballot = steps.vote([*merger.points(now, window), *(body.points for body in bodies)])
+    ballot.free[:] = space.count("scene", now, window)
     ballot.free[steps.in_body] = own_free
-    space.in_bodies(merger, now, window, regions, ballot.free)
+    space.add_bodies(bodies, now, ballot.free)
     votes = ballot.votes(copy=False)
     del ballot
     # The votes are whole now: what follows decides, completes and corrects, in this order.
@@ -106,19 +104,20 @@ def merge_frame(
     # In these voxels, free space of rays beside a body or of other times does not count.
     contested = steps.contested()
     recent = merger.recent(now, window) if len(contested) else []
-    unseen = contested[~space.is_seen(merger, now, recent, contested)]
+    unseen = contested[space.count("recent", now, recent, contested) == 0]
     doubtful = np.concatenate([regions.hidden, unseen])
     made.forget(doubtful[made.labels[doubtful] == 0])
 
     # Actors are completed by their mirror images, then by the surfaces of their tracks.
     completed = list[tuple[IntArray, AnyArray]]()
     if regions.actors and options.complete != "seen":
-        mirrored = steps.vote(points=merger.in_bodies(now, window, regions, mirror=True))
-        space.in_bodies(merger, now, window, regions, mirrored.free, mirror=True)
+        bodies = list(merger.bodies(now, window, regions, mirror=True))
+        mirrored = steps.vote(body.points for body in bodies)
+        space.add_bodies(bodies, now, mirrored.free)
         completed.append(steps.complete(made, mirrored.votes(copy=False)))
         if options.complete == "body":
             del mirrored
-            shells = steps.vote(points=merger.shells(now, regions))
+            shells = steps.vote(merger.shells(now, regions))
             completed.append(steps.complete(made, shells.votes(copy=False)))
 
     # After completion: an inferred body must not stand where the recording vehicle drove.
@@ -141,7 +140,7 @@ def merge_frame(
         steps.flags(inferred, contested, seen_now),
         _join_shares(votes, consensus, completed, classes),
     )
-    views = space.views(merger, now, window)
+    views = space.count("views", now, window)
     views[steps.in_body] = 0  # rays of other times
     np.maximum.at(views, votes.occupied["voxel"], votes.occupied["voters"])
     np.maximum(views, made.counts > 0, out=views)  # free space is summed over smaller cells
@@ -331,10 +330,8 @@ class _FrameSteps:
             flags[where] |= np.uint8(flag)
         return flags
 
-    def vote(
-        self, observations: Iterable[Observation] = (), points: Iterable[SeenClass] = ()
-    ) -> Ballot:
-        """Return the votes of observations, and of points without rays."""
+    def vote(self, points: Iterable[SeenClass], observations: Iterable[Observation] = ()) -> Ballot:
+        """Return the votes of points without rays, and of observations."""
         ballot = Ballot(
             self.plan.spec,
             self.feed.classes,
@@ -378,10 +375,12 @@ class _FrameSteps:
         """Return the voxels outside of bodies that moving points are in at other times."""
         if self.feed.options.dynamic != "align":
             return _NO_VOXELS
-        others = [other for other in self.window if other != self.now.frame]
-        passing = list(self.merger.moving(self.now, others))
-        moving = self.vote(points=[(self.feed.classes.geometry_id, passing, *EVERYWHERE)])
-        return np.flatnonzero(moving.hit & ~self.in_body)
+        passing = np.zeros(self.plan.spec.num_voxels, np.int32)
+        for other in self.window:
+            if other != self.now.frame:
+                grid_T_sensor = self.now.grid_T_world @ self.feed.pose(other)
+                count_points(self.merger.moving(other), grid_T_sensor, self.plan.spec, passing)
+        return np.flatnonzero((passing > 0) & ~self.in_body)
 
     def keep_returns(self, made: _UnfinishedGrid, votes: Votes, consensus: ClassConsensus) -> None:
         """Make voxels with returns of the frame's own scan occupied, unless the returns are

@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -33,7 +33,6 @@ from carlasc.core.grids import GridSpec
 from carlasc.core.scans import RaysFromPlace, lengths, runs_of_origins
 from carlasc.groundtruth.options import Dynamic
 from carlasc.groundtruth.voting.ballot import EVERYWHERE, ClassPoints, Observation, SeenClass
-from carlasc.groundtruth.voting.free_maps import Cast
 from carlasc.motion import BODY_MARGIN_M
 from carlasc.motion.tracks import MovingActors, Track
 from carlasc.storage import layout
@@ -45,7 +44,7 @@ RECENT_S = 0.25  # scans within this time before and after a frame show the scen
 # Points so near to the body of an actor may belong to it, as paths have errors: metres along,
 # across and up.
 _AROUND_M = np.array([0.3, 0.3, 0.1])
-MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -66,6 +65,24 @@ class Instant:
     def grid_T_world(self) -> Transform:
         """(4, 4), the inverse of the grid's pose."""
         return invert(self.world_T_grid)
+
+
+class Cast(NamedTuple):
+    """The rays of one scan.
+
+    Attributes:
+        points: (N, 3) float32, metres, from the origin of each ray, in the order of origins.
+        ends: (K,) index after the last point of each origin.
+        map_T_places: (K, 4, 4) poses of the origins.
+        lower: (3,) lower corner of the region in which the rays count, metres, frame of the map.
+        upper: (3,) upper corner.
+    """
+
+    points: Float32Array
+    ends: IntArray
+    map_T_places: FloatArray
+    lower: FloatArray
+    upper: FloatArray
 
 
 @dataclass(frozen=True)
@@ -153,13 +170,8 @@ class PreparedScan:
 
     @cached_property
     def world_T_places(self) -> FloatArray:
-        """(4, 4) pose of the sensor, or (K, 4, 4) poses of the origins of rays."""
-        places = np.stack([rays.sensor_T_place for rays in self.rays])
-        return (
-            self.world_T_sensor @ places
-            if len(places) > 1 or places[0, :3, 3].any()
-            else self.world_T_sensor
-        )
+        """(K, 4, 4) poses of the origins of rays."""
+        return self.world_T_sensor @ np.stack([rays.sensor_T_place for rays in self.rays])
 
     def cast(self, map_T_world: Transform, lower: FloatArray, upper: FloatArray) -> Cast:
         """Return the rays for a map of free space: those that pass through a region.
@@ -169,13 +181,10 @@ class PreparedScan:
             lower: (3,) lower corner of the region, metres, frame of the map.
             upper: (3,) upper corner.
         """
-        places = (map_T_world @ self.world_T_places).reshape(-1, 4, 4)
-        # where no point is, no ray is
-        reached = np.concatenate([places[:, :3, 3] - self.reach_m, places[:, :3, 3] + self.reach_m])
-        lower, upper = (
-            np.maximum(lower, reached.min(axis=0)),
-            np.minimum(upper, reached.max(axis=0)),
-        )
+        places = map_T_world @ self.world_T_places
+        origins, reach_m = places[:, :3, 3], self.reach_m  # where no point is, no ray is
+        lower = np.maximum(lower, origins.min(axis=0) - reach_m)
+        upper = np.minimum(upper, origins.max(axis=0) + reach_m)
         return Cast(self.ends, self.runs, places, lower, upper)
 
     @property
@@ -210,6 +219,22 @@ class _Carried:
 
     cast: Cast
     points: Float32Array
+
+
+class SeenBody(NamedTuple):
+    """What scans saw of the body of an actor.
+
+    Attributes:
+        number: number of the actor.
+        world_T_actor: (4, 4) pose of the actor at the frame of the grid.
+        casts: the rays of each scan through the body, frame of the actor, by frame.
+        points: the points of the actor, in the voxels of its body.
+    """
+
+    number: int
+    world_T_actor: Transform
+    casts: dict[int, Cast]
+    points: SeenClass
 
 
 class Merger:
@@ -247,12 +272,11 @@ class Merger:
     def own(self, now: Instant) -> Observation:
         """Return the observation by the frame's own scan, whose rays count everywhere."""
         scan = self.scan_of(now.frame)
-        ends = None if scan.world_T_places.ndim == 2 else scan.runs
         places = now.grid_T_world @ scan.world_T_places
-        return Observation(scan.ends, self.labels(now.frame), places, ends)
+        return Observation(scan.ends, self.labels(now.frame), places, scan.runs)
 
-    def points(self, now: Instant, window: Iterable[int]) -> Iterator[SeenClass]:
-        """Yield the static points of each scan, and all points of the frame's own scan, by class.
+    def points(self, now: Instant, window: Iterable[int]) -> list[SeenClass]:
+        """Return the static points of each scan, and all points of the frame's own scan, by class.
 
         Static surfaces vote everywhere, so the road below an actor is kept.
 
@@ -262,77 +286,62 @@ class Merger:
         """
         found = defaultdict[int, list[ClassPoints]](list)
         for other in window:
-            key = other, other == now.frame
-            if key not in self._points:
-                self._points[key] = dict(self._by_class(*key))
-            pose = now.grid_T_world @ self.scan_of(other).world_T_sensor
-            for label, seen in self._points[key].items():
+            scan, own = self.scan_of(other), other == now.frame
+            if (other, own) not in self._points:
+                all_vote = self.dynamic == "tube" or (own and self.dynamic != "drop")
+                votes = ~self.actors.is_own(scan.points) if all_vote else self.static(other)
+                self._points[other, own] = self._by_class(scan, votes)
+            pose = now.grid_T_world @ scan.world_T_sensor
+            for label, seen in self._points[other, own].items():
                 found[label].append(seen._replace(grid_T_points=pose))
-        for label, points in found.items():
-            yield label, points, *EVERYWHERE
+        return [(label, points, *EVERYWHERE) for label, points in found.items()]
 
-    def _votes(self, frame: int, own: bool) -> BoolArray:
-        """Return (N,) bool: the points of a scan that vote in its own frame, or in others."""
-        if self.dynamic == "tube" or (own and self.dynamic != "drop"):
-            return ~self.actors.is_own(self.scan_of(frame).points)
-        return self.static(frame)
-
-    def _by_class(self, frame: int, own: bool) -> Iterator[tuple[int, ClassPoints]]:
-        scan = self.scan_of(frame)
-        labels = np.where(self._votes(frame, own), self.labels(frame), np.uint16(0))
+    def _by_class(self, scan: PreparedScan, votes: BoolArray) -> dict[int, ClassPoints]:
+        """Return the points of a scan that vote, (N,) bool, by class; their poses are not set."""
+        found, labels = {}, np.where(votes, self.labels(scan.frame), np.uint16(0))
         for label in np.flatnonzero(np.bincount(labels)).tolist():
-            rows = np.flatnonzero(labels == label) if label else ()
-            if len(rows):
+            if label:
+                rows = np.flatnonzero(labels == label)
                 points = np.ascontiguousarray(scan.points[rows].T)
                 sure = None if scan.sure is None else scan.sure[rows]
-                yield label, ClassPoints(points, scan.world_T_sensor, sure)
+                found[label] = ClassPoints(points, scan.world_T_sensor, sure)
+        return found
 
-    def in_bodies(
+    def bodies(
         self, now: Instant, window: Iterable[int], regions: BodyRegions, *, mirror: bool = False
-    ) -> Iterator[SeenClass]:
-        """Yield the points of each actor in other scans, in the voxels of its body.
+    ) -> Iterator[SeenBody]:
+        """Yield what other scans saw of each actor in its body, without actors that none saw.
 
         Args:
             now: the frame.
             window: frames of the scans.
             regions: the voxels of the bodies.
-            mirror: yield mirror images instead. Vehicles are symmetric: their points are reflected
-                in the vertical plane through the middle of the body, if that is known. Only mirror
-                images use the frame's own scan.
+            mirror: yield mirror images instead. Vehicles are symmetric: their points and rays are
+                reflected in the vertical plane through the middle of the body, if that is known.
+                Only mirror images use the frame's own scan.
         """
         for region, number in regions.actors.items():
-            track, seen = self.actors.tracks[number], self.seen(number, now, window, mirror)
+            track = self.actors.tracks[number]
             pose = track.pose(now.frame)
-            if pose is not None:
-                grid_T_points = now.grid_T_world @ pose @ (MIRROR if mirror else np.eye(4))
-                points = [ClassPoints(one.points, grid_T_points) for one in seen.values()]
-                yield track.label, points, regions.of_voxel, region
+            if pose is None or (mirror and not (track.rigid and any(track.extent.known))):
+                continue
+            pose = pose @ _MIRROR if mirror else pose
+            casts, points, grid_T_actor = {}, [], now.grid_T_world @ pose
+            for other in window:
+                if mirror or other != now.frame:
+                    carried = self._carry(number, other, now)
+                    if carried is not None:
+                        casts[other] = carried.cast
+                        points.append(ClassPoints(carried.points, grid_T_actor))
+            if casts:
+                votes = track.label, points, regions.of_voxel, region
+                yield SeenBody(number, pose, casts, votes)
 
-    def seen(
-        self, number: int, now: Instant, window: Iterable[int], mirror: bool
-    ) -> dict[int, _Carried]:
-        """Return what the scans of a window saw of the body of an actor, by frame: without the
-        frame's own scan, or with it for a mirror image; nothing if it has no mirror image.
-        """
-        track = self.actors.tracks[number]
-        if mirror and not (track.rigid and any(track.extent.known)):
-            return {}
-        found = {}
-        for other in window:
-            if mirror or other != now.frame:
-                carried = self._carry(number, other, now)
-                if carried is not None:
-                    found[other] = carried
-        return found
-
-    def moving(self, now: Instant, window: Iterable[int]) -> Iterator[ClassPoints]:
-        """Yield the moving points of scans, of all classes, at their positions in these scans."""
-        for other in window:
-            scan = self.scan_of(other)
-            if other not in self._moving:
-                moving = scan.points[~self.static(other)]
-                self._moving[other] = np.ascontiguousarray(moving.T)
-            yield ClassPoints(self._moving[other], now.grid_T_world @ scan.world_T_sensor)
+    def moving(self, frame: int) -> Float32Array:
+        """Return the (M, 3) moving points of a scan, metres, sensor frame."""
+        if frame not in self._moving:
+            self._moving[frame] = self.scan_of(frame).points[~self.static(frame)]
+        return self._moving[frame]
 
     def recent(self, now: Instant, window: Iterable[int]) -> list[int]:
         """Return the frames of the scans within `RECENT_S` of the frame."""
@@ -463,10 +472,9 @@ class BodyRegions:
         ]
         regions = cls.of_bodies(spec, now.world_T_grid, present)
         if merger.dynamic in ("align", "current") and now.frame in window:
-            scan = merger.scan_of(now.frame)
-            moving = scan.points[~merger.static(now.frame)]
+            grid_T_sensor = now.grid_T_world @ merger.scan_of(now.frame).world_T_sensor
             return regions.with_points(
-                spec, transform_points(now.grid_T_world @ scan.world_T_sensor, moving)
+                spec, transform_points(grid_T_sensor, merger.moving(now.frame))
             )
         return regions
 

@@ -256,22 +256,22 @@ class Ballot:
     def add_points(self, seen: Iterable[SeenClass]) -> None:
         """Add the votes of points without rays, one class after the other."""
         from carlasc.core.cells import as_pose
-        from carlasc.groundtruth.voting import hits
+        from carlasc.groundtruth.voting import kernel
 
-        counted = np.zeros(self.spec.num_voxels + 1, hits.HIT_DTYPE)
+        counted = np.zeros(self.spec.num_voxels + 1, kernel.HIT_DTYPE)
         for label, voters, regions, region in seen:
             points = sum(one.points.shape[1] for one in voters)
-            hit, used = np.empty(min(points, len(counted)), np.int32), np.zeros(1, np.int64)
+            hit, number = np.empty(min(points, len(counted)), np.int32), 0
             certain = all(one.sure is None for one in voters)
             doubt = np.zeros(0 if certain else len(counted), np.float32)
             for voter, one in enumerate(voters, 1):
                 pose, sure = as_pose(one.grid_T_points), _ready(one.sure, np.float32)
-                hits.count_hits(
-                    one.points, sure, pose, self._cells, voter, counted, doubt, hit, used
+                number = kernel.count_hits(
+                    one.points, sure, pose, self._cells, voter, counted, doubt, hit, number
                 )
                 self._widen(one.points, pose, regions, region)
-            self._make_room(int(used[0]))
-            hits.add_hits(label, counted, doubt, hit[: used[0]], regions, region, self._tally)
+            self._make_room(number)
+            kernel.add_hits(label, counted, doubt, hit[:number], regions, region, self._tally)
 
     def _widen(self, points: Float32Array, pose: Pose, regions: Uint16Array, region: int) -> None:
         from carlasc.groundtruth.voting import filled

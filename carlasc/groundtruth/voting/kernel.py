@@ -1,5 +1,5 @@
-"""The compiled loops of voting: they add the votes of one observation, and collect the counted
-votes.
+"""The compiled loops of voting: they add the votes of one observation, or of points without rays,
+and collect the counted votes.
 
 Rays are processed in blocks. The vectorised code of rays.py clips them to the grid and finds the
 voxels of their samples. Where rounding could change the voxel, the exact rule finds it. Votes for
@@ -22,7 +22,7 @@ from carlasc.core.arrays import (
     Uint8Array,
     Uint16Array,
 )
-from carlasc.core.cells import Cells, Pose, transform
+from carlasc.core.cells import Cells, Pose, find_voxel, pose_of, transform
 from carlasc.core.compiling import cached, inlined, jit
 from carlasc.groundtruth.voting.rays import (
     CHUNK,
@@ -62,6 +62,9 @@ CANDIDATE_DTYPE = np.dtype(
 """A candidate class of a voxel: its votes, its last voter, its number of voters, the summed doubt
 of its votes, and the next candidate.
 """
+
+HIT_DTYPE = np.dtype([("votes", np.int32), ("voters", np.uint16), ("last", np.uint16)])
+"""The votes of a voxel for the class, the number of their voters, and the last voter."""
 
 
 class Tally(NamedTuple):
@@ -276,8 +279,7 @@ def vote(cast: Voters, cells: Cells, free_step_m: float, voter: int, tally: Tall
     points, labels, poses, ends = cast
     rays, voxels, begin = empty_rays(BLOCK), np.empty(BLOCK, np.int32), 0
     for place in range(len(ends)):
-        p = poses[place]
-        pose = (p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11])
+        pose = pose_of(poses, place)
         view = view_from(pose, cells)
         # Blocks fit into the cache: what one of the passes over a block writes, the next one reads.
         while begin < ends[place]:
@@ -292,6 +294,97 @@ def vote(cast: Voters, cells: Cells, free_step_m: float, voter: int, tally: Tall
             for v in range(len(tally.passed)):
                 tally.free[v] += tally.passed[v]
                 tally.passed[v] = 0
+
+
+@cached
+def count_hits(
+    points: Float32Array,
+    sure: Float32Array,
+    pose: Pose,
+    cells: Cells,
+    voter: int,
+    hits: AnyArray,
+    doubt: Float32Array,
+    hit: Int32Array,
+    number: int,
+) -> int:
+    """Count the points of one class of one voter, and return the number of voxels with votes.
+
+    Most voxels have points of many scans. A dense count finds them faster than lists of candidates.
+
+    Args:
+        points: (3, N) metres.
+        sure: (N,) probability of the class of each point; empty: 1.
+        pose: grid_T_points.
+        cells: the cells of the grid.
+        voter: number of the voter, from 1.
+        hits: (V + 1,) HIT_DTYPE, 0 without votes; the last element counts points outside.
+        doubt: (V + 1,) the summed doubt; empty if all classes are certain.
+        hit: (N,) the voxels with votes, in the order of their first votes.
+        number: how many of them there were before.
+    """
+    view, voxels, begin = view_from(pose, cells), np.empty(BLOCK, np.int32), 0
+    xs, ys, zs = points[0], points[1], points[2]
+    doubts, own = len(sure) > 0, np.uint16(voter)
+    while begin < len(xs):
+        # Places of a block first, in vectorised code.
+        size = min(BLOCK, len(xs) - begin)
+        if view.cylindrical:
+            for i in range(size):
+                x, y, z = transform(view.pose, xs[begin + i], ys[begin + i], zs[begin + i])
+                voxels[i] = place_cylindrical(x, y, z, view)
+        else:
+            for i in range(size):
+                x, y, z = transform(view.pose, xs[begin + i], ys[begin + i], zs[begin + i])
+                voxels[i] = place_cartesian(x, y, z, view)
+        for i in range(size):
+            voxel = voxels[i]
+            if voxel == DOUBTFUL:
+                x, y, z = transform(pose, xs[begin + i], ys[begin + i], zs[begin + i])
+                voxel = find_voxel(x, y, z, cells)
+            if hits[voxel].votes == 0:
+                hit[number] = voxel
+                number += 1
+            hits[voxel].votes += 1
+            hits[voxel].voters += hits[voxel].last != own
+            hits[voxel].last = own
+            # The doubt is summed, not the certainty: it is 0 for labels without probabilities.
+            if doubts:
+                doubt[voxel] += np.float32(1) - sure[begin + i]
+        begin += size
+    return number
+
+
+@cached
+def add_hits(
+    label: int,
+    hits: AnyArray,
+    doubt: Float32Array,
+    hit: Int32Array,
+    regions: Uint16Array,
+    region: int,
+    tally: Tally,
+) -> None:
+    """Add the counted votes to the candidates, for which there must be room, and clear them.
+
+    Args:
+        label: the class.
+        hits: (V + 1,) HIT_DTYPE.
+        doubt: (V + 1,) the summed doubt, or empty.
+        hit: (N,) the voxels that have votes.
+        regions: (V,) region of each voxel; empty: all voxels count.
+        region: the region whose voxels count.
+        tally: the votes so far.
+    """
+    for voxel in hit:
+        if voxel < len(tally.heads) and (len(regions) == 0 or regions[voxel] == region):
+            entry = find_candidate(voxel, label, tally)
+            candidate = tally.candidates[entry]
+            candidate.votes += hits[voxel].voters if tally.once else hits[voxel].votes
+            candidate.voters += hits[voxel].voters
+            candidate.doubt += doubt[voxel] if len(doubt) else np.float32(0)
+            candidate.voter = NONE
+        hits[voxel].votes = hits[voxel].voters = hits[voxel].last = 0
 
 
 @cached
