@@ -376,8 +376,15 @@ class Merger:
             ground = np.isin(scan.labels, sorted(self.classes.ground))
             for track in self.actors.tracks.values():
                 static[track.members.get(frame, [])] = False
-                near = _points_near(track, scan)
-                static[near[~ground[near]]] = False
+                lower, upper = track.lower - _AROUND_M, track.upper + _AROUND_M
+                pose = track.pose(frame)
+                for rays, actor_T_place, crossing in (
+                    () if pose is None else scan.through(pose, lower, upper)
+                ):
+                    body = transform_points(actor_T_place, rays.points[crossing])
+                    inside = ((body >= lower) & (body <= upper)).all(axis=1)
+                    near = rays.part.start + crossing[inside]
+                    static[near[~ground[near]]] = False
             self._static[frame] = static
         return self._static[frame]
 
@@ -418,20 +425,6 @@ class Merger:
                 points = np.ascontiguousarray(np.concatenate(hits).T)
                 self._carried[key] = _Carried(cast, points)
         return self._carried.setdefault(key, None)
-
-
-def _points_near(track: Track, scan: PreparedScan) -> IntArray:
-    """Return the indices of the points of a scan that are in the body of an actor, or within
-    `_AROUND_M` of it.
-    """
-    pose, near = track.pose(scan.frame), [np.empty(0, np.int64)]
-    if pose is None:
-        return near[0]
-    lower, upper = track.lower - _AROUND_M, track.upper + _AROUND_M
-    for rays, actor_T_place, crossing in scan.through(pose, lower, upper):
-        body = transform_points(actor_T_place, rays.points[crossing])
-        near.append(rays.part.start + crossing[((body >= lower) & (body <= upper)).all(axis=1)])
-    return np.concatenate(near)
 
 
 @dataclass(frozen=True)
