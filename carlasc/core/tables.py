@@ -8,7 +8,10 @@ from types import MappingProxyType
 import numpy as np
 
 from carlasc.core.arrays import LabelArray
-from carlasc.core.classes import BUILT_IN, ClassTable, Remap, color_of, table_from_json
+from carlasc.core.classes import BUILT_IN, ClassTable, Remap, color_of
+from carlasc.core.classes import table_from_json as table_from_json  # noqa: PLC0414 (part of it)
+from carlasc.core.classes import table_named as table_named  # noqa: PLC0414 (part of it)
+from carlasc.core.classes import table_to_json as table_to_json  # noqa: PLC0414 (part of it)
 from carlasc.errors import ArgumentError, FormatError, check_choice
 
 

@@ -22,9 +22,9 @@ from carlasc.core.arrays import FloatArray
 from carlasc.core.boxes import BOXES_DTYPE
 from carlasc.core.choices import Axes as Axes  # noqa: PLC0414 (public in this room)
 from carlasc.core.choices import Coordinates
-from carlasc.core.classes import ClassTable, table_from_json, table_to_json
+from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
-from carlasc.core.tables import CARLA
+from carlasc.core.tables import CARLA, table_from_json, table_to_json
 from carlasc.errors import FormatError
 from carlasc.storage.field_files import Field
 from carlasc.storage.files import parse_json, to_json

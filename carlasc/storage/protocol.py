@@ -21,12 +21,13 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, IntArray, LabelArray
 from carlasc.core.boxes import Boxes
-from carlasc.core.classes import ClassTable, TableUse, table_from_json
+from carlasc.core.classes import ClassTable, TableUse
 from carlasc.core.frames import check_seconds
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import Coordinates, Grid, GridSpec
 from carlasc.core.notebook import describe
 from carlasc.core.scans import Scan
+from carlasc.core.tables import table_from_json
 from carlasc.errors import (
     ConflictError,
     FormatError,

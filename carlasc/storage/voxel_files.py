@@ -19,9 +19,9 @@ from typing import Literal, cast
 import numpy as np
 
 from carlasc.core.arrays import AnyArray, BoolArray, FloatArray, IntArray, LabelArray
-from carlasc.core.classes import ClassTable, TableUse, table_to_json, tables_with, times
+from carlasc.core.classes import ClassTable, TableUse, tables_with, times
 from carlasc.core.grids import GridSpec
-from carlasc.core.tables import CARLASC11
+from carlasc.core.tables import CARLASC11, table_to_json
 from carlasc.errors import FormatError, MissingDataError, load_plugin, plugin_names
 from carlasc.storage import layout
 from carlasc.storage.files import to_json

@@ -1,18 +1,11 @@
 import json
-from functools import partial
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from carlasc.core.classes import (
-    ClassTable,
-    Remap,
-    class_weights,
-    table_from_json,
-    table_to_json,
-)
+from carlasc.core.classes import ClassTable, Remap, class_weights
 from carlasc.core.tables import (
     CARLA,
     CARLASC11,
@@ -22,6 +15,9 @@ from carlasc.core.tables import (
     TABLES,
     TRAIN_VOXEL_COUNTS,
     remap_named,
+    table_from_json,
+    table_named,
+    table_to_json,
 )
 from carlasc.errors import ArgumentError, FormatError
 
@@ -145,7 +141,7 @@ def test_weights_follow_the_published_rule():
 def test_names_that_do_not_exist_are_answered_with_those_that_do():
     for kind, ask, name, known in (
         (ArgumentError, remap_named, "x", "carlasc11"),
-        (FormatError, partial(table_from_json, where="a.json"), "x", "carla"),
+        (FormatError, table_named, "x", "carla"),
         (ArgumentError, CARLA.id_of, "Spaceship", "Vehicle"),
     ):
         with pytest.raises(kind) as error:

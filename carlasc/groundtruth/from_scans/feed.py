@@ -144,7 +144,7 @@ class ScanFeed:
             else metadata.max_range_m or np.inf
         )
         self._scans: OrderedDict[int, PreparedScan] = OrderedDict()
-        self._merger: Merger | None = None
+        self._merger = Merger(self.read, MovingActors(), self.classes, options.dynamic)
         self._free: FreeSpace | None = None
         self._lock = threading.RLock()  # an executor may be of threads
         self.key = uuid4().hex
@@ -341,8 +341,6 @@ class ScanFeed:
         Its caches are kept from frame to frame.
         """
         with self._lock:
-            if self._merger is None:
-                self._merger = Merger(self.read, actors, self.classes, self.options.dynamic)
             self._merger.actors = actors
             self._merger.forget_before(frame + self.options.window[0])
             return self._merger
@@ -353,6 +351,7 @@ class ScanFeed:
         corners, map_T_world = _corners(spec), invert(self.pose(int(self.frames[0])))
 
         def cast_of(frame: int, within_s: float) -> Cast:
+            # of all frames, made or not: counts do not depend on which frames are made
             near = self.frames[(self.frames >= frame - last) & (self.frames <= frame - first)]
             grids = [
                 transform_points(self.pose(other), corners)

@@ -23,7 +23,6 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.groundtruth.from_scans.actor_voxels import find_voxels
 from carlasc.groundtruth.from_scans.feed import ScanFeed
-from carlasc.groundtruth.from_scans.free_space import FreeSpace
 from carlasc.groundtruth.from_scans.merging import STATIC, BodyRegions, Instant, Merger
 from carlasc.groundtruth.inputs import FrameData, GridPlan
 from carlasc.groundtruth.voting.ballot import Ballot, Observation, SeenClass, Votes
@@ -80,7 +79,7 @@ def merge_frame(
     regions = BodyRegions.at(merger, now, window, plan.spec)
     space = feed.free_space(plan.spec, plan.voting.free_step_m, plan.rule == "sensor")
     space.forget_others(merger.actors.tracks)
-    steps = _FrameSteps(plan, feed, merger, now, window, regions, space)
+    steps = _FrameSteps(plan, feed, merger, now, window, regions)
     own = steps.vote([], [merger.own(now)] if frame in window else [])
     own_free, seen_now = own.free[steps.in_body], own.seen()
     del own  # frees memory for the next ballots
@@ -246,7 +245,6 @@ class _FrameSteps:
     now: Instant
     window: list[int]
     regions: BodyRegions
-    space: FreeSpace
 
     @cached_property
     def in_body(self) -> BoolArray:

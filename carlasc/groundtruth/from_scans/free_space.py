@@ -27,7 +27,9 @@ from carlasc.groundtruth.voting.rays import DROPPED, clip, empty_rays, view_from
 
 _BITS = 3  # a block has 2 ** _BITS cells along each edge
 _EDGE = 1 << _BITS
-_CELL_M = 0.05  # height of a cell; rays that graze the ground decide it
+# About the height of a cell, as most rays graze the ground, and its width in the map of an actor.
+# With wider ones, pedestrians lose: see docs/studies/rays.md.
+_CELL_M = 0.05
 _MOST = 8  # greatest number of cells along an edge of a voxel; the least is 2
 _FEWEST = 256  # least number of blocks by which a map grows
 
@@ -188,12 +190,16 @@ class FreeMap:
         self._stamp += 1
         points = np.ascontiguousarray(cast.points).reshape(-1)
         places = cast.map_T_places[:, :3].reshape(-1, 12)
-        size: tuple[int, int, int] = tuple(((upper - lower) * _EDGE).tolist())
-        low, high = (
-            (float(x), float(y), float(z))
-            for x, y, z in (lower * _EDGE * self._cell, upper * _EDGE * self._cell)
+        size, low, high, cell = (
+            (x, y, z)
+            for x, y, z in (
+                ((upper - lower) * _EDGE).tolist(),
+                (lower * _EDGE * self._cell).tolist(),
+                (upper * _EDGE * self._cell).tolist(),
+                self._cell.tolist(),
+            )
         )
-        region = Cells(False, size, low, high, tuple(self._cell.tolist()))
+        region = Cells(False, size, low, high, cell)
         begin, change, ray = lower - self._blocks.first, (sign, self._stamp), 0
         while ray < len(cast.points):
             ray = _trace(
@@ -208,7 +214,7 @@ class FreeMap:
         more = max(size // 4, _FEWEST)
         for cells in (old.counts, old.stamps) if self.views else (old.counts,):
             cells.resize((size + more, _EDGE**3), refcheck=False)  # without a copy
-        # the last ones are taken first: memory that was used before
+        # the lowest ones are taken first, from the end: memory that was used before
         unused = np.concatenate([np.arange(size + more - 1, size - 1, -1), old.unused])
         old.left[0] += more
         self._blocks = old._replace(unused=unused.astype(np.int32))
@@ -223,15 +229,13 @@ class FreeMap:
         slots = np.full(last - first, -1, np.int32)
         low = np.maximum(first, old.first)
         high = np.maximum(np.minimum(last, old.first + old.slots.shape), low)
-        kept = tuple(map(slice, low - old.first, high - old.first))
-        slots[tuple(map(slice, low - first, high - first))] = old.slots[kept]
-        gone = old.slots.copy()
-        gone[kept] = -1
-        gone = gone[gone >= 0]
-        count = int(old.left[0])
-        old.unused[count : count + len(gone)] = gone
-        old.left[0] += len(gone)
-        self._blocks = old._replace(first=first, slots=slots)
+        kept = old.slots[tuple(map(slice, low - old.first, high - old.first))]
+        slots[tuple(map(slice, low - first, high - first))] = kept
+        is_unused = np.ones(len(old.counts), np.bool_)
+        is_unused[kept[kept >= 0]] = False
+        unused = np.flatnonzero(is_unused)[::-1].astype(np.int32)
+        left = np.array([len(unused)])
+        self._blocks = old._replace(first=first, slots=slots, unused=unused, left=left)
 
     def count(self, map_T_grid: Transform, voxels: IntArray | None = None) -> Uint32Array:
         """Return the number of samples, or of scans, in each of (M,) voxels of a grid.
@@ -240,14 +244,12 @@ class FreeMap:
             map_T_grid: (4, 4), which may mirror.
             voxels: (M,) flat indices; None: all voxels.
         """
+        chosen = np.arange(self.spec.num_voxels) if voxels is None else voxels
         cells_T_grid = map_T_grid.copy()
         cells_T_grid[:3] /= self._cell[:, None]
-        found = np.empty(self.spec.num_voxels if voxels is None else len(voxels), np.uint32)
-        chosen = np.empty(0, np.int64) if voxels is None else voxels
-        parts, volume = self._parts, float(self._cell.prod())
-        _gather(
-            chosen, as_pose(cells_T_grid), Cells.of(self.spec), parts, volume, self._blocks, found
-        )
+        pose, cells, volume = as_pose(cells_T_grid), Cells.of(self.spec), float(self._cell.prod())
+        found = np.empty(len(chosen), np.uint32)
+        _gather(chosen, pose, cells, self._parts, volume, self._blocks, found)
         return found
 
 
@@ -274,10 +276,13 @@ def _trace(
         region: the cells of the region, of whole blocks.
         step_m: distance between two samples, metres.
         begin: (3,) the first block of the region, counted from that of the map.
-        change: what a sample adds, and the number of the scan and of this change, which the cells
-            get if views are counted.
+        change: what a sample adds, and a number that no scan before had, which the cells get if
+            views are counted: a scan counts once in each.
         blocks: the blocks.
     """
+    # A scan is removed with the poses, the region and the arithmetic with which it was added. So
+    # the same cells change, and their counts return to what they were. Samples near the edge of a
+    # cell need no exact rule therefore, unlike those of the kernel.
     _, slots, unused, left, counts, stamps = blocks
     views, sign, stamp = len(stamps) > 0, change[0], change[1]
     block_x, block_y, block_z = begin[0], begin[1], begin[2]
@@ -293,6 +298,7 @@ def _trace(
                 dx, dy, dz = rays.dx[i], rays.dy[i], rays.dz[i]
                 if rays.state[i] == DROPPED or last < step:
                     continue
+                # Each sample may need a block. A ray is added whole, so that it can begin again.
                 if left[0] <= last - step:
                     return ray + i
                 while step <= last:
@@ -373,30 +379,31 @@ def _gather(
     """Sum the counts of the cells in voxels: at places that are evenly spread in each voxel.
 
     Args:
-        voxels: (M,) flat indices; empty: all voxels. Those above each other are read together.
+        voxels: (M,) flat indices. Those above each other are read together.
         pose: cells_T_grid.
         cells: the grid.
         parts: number of cells along the edges of a voxel.
         volume: of a cell.
         blocks: the blocks.
-        found: (M,) or (V,) output.
+        found: (M,) output.
     """
     across, along, up = parts
     size, voxel_size, first = cells.size, cells.voxel_size, blocks.first
     columns, row = np.empty(size[2] * up, np.int64), 0
     rise = voxel_size[2] / up
     stride = pose[2] * rise, pose[6] * rise, pose[10] * rise
-    while row < len(found):
-        voxel = voxels[row] if len(voxels) else row
+    while row < len(voxels):
+        voxel = voxels[row]
         i, j, k = voxel // (size[1] * size[2]), voxel // size[2] % size[1], voxel % size[2]
         height, weight, many = 1, 1.0, along
         while (
-            row + height < len(found)
+            row + height < len(voxels)
             and k + height < size[2]
-            and (len(voxels) == 0 or voxels[row + height] == voxel + height)
+            and voxels[row + height] == voxel + height
         ):
             height += 1
         if cells.cylindrical and along > 1:
+            # about one place in the width of each cell, as in x, but not more than 16
             wide = (cells.lower[0] + (i + 0.5) * voxel_size[0]) * voxel_size[1]
             many = int(min(max(math.ceil(2 * wide / voxel_size[0]), 1.0), 16.0))
             weight = wide * voxel_size[0] * voxel_size[2] / (across * many * up * volume)
@@ -413,5 +420,6 @@ def _gather(
                 _add_column(start, stride, blocks.slots, blocks.counts, column)
         for k in range(height):
             total = column[k * up : (k + 1) * up].sum()
+            # rays passed through the voxel: it does not become unknown by rounding
             found[row + k] = max(round(total * weight), 1) if total > 0 else 0
         row += height

@@ -317,7 +317,7 @@ def count_hits(
         sure: (N,) probability of the class of each point; empty: 1.
         pose: grid_T_points.
         cells: the cells of the grid.
-        voter: number of the voter, from 1.
+        voter: number of the voter, from 1: `last` is 0 without one.
         hits: (V + 1,) HIT_DTYPE, 0 without votes; the last element counts points outside.
         doubt: (V + 1,) the summed doubt; empty if all classes are certain.
         hit: (N,) the voxels with votes, in the order of their first votes.
@@ -383,7 +383,7 @@ def add_hits(
             candidate.votes += hits[voxel].voters if tally.once else hits[voxel].votes
             candidate.voters += hits[voxel].voters
             candidate.doubt += doubt[voxel] if len(doubt) else np.float32(0)
-            candidate.voter = NONE
+            candidate.voter = NONE  # the next observation is another voter
         hits[voxel].votes = hits[voxel].voters = hits[voxel].last = 0
 
 
