@@ -255,19 +255,19 @@ class Merger:
         dynamic: Dynamic,
     ) -> None:
         self.scan_of, self.actors, self.classes, self.dynamic = scan_of, actors, classes, dynamic
-        self._static: dict[int, BoolArray] = {}
-        self._labels: dict[int, Uint16Array] = {}
-        self._carried: dict[tuple[int, int], _Carried | None] = {}
-        self._points: dict[tuple[int, bool], dict[int, ClassPoints]] = {}
-        self._moving: dict[int, Float32Array] = {}
+        # of each scan, by its frame; then of its points by class, in its own grid or in others, and
+        # of what it saw of each actor
+        self._static = dict[int, BoolArray]()
+        self._labels = dict[int, Uint16Array]()
+        self._moving = dict[int, Float32Array]()
+        self._points = defaultdict[int, dict[bool, dict[int, ClassPoints]]](dict)
+        self._carried = defaultdict[int, dict[int, _Carried | None]](dict)
 
     def forget_before(self, frame: int) -> None:
         """Clear the caches of scans before a frame."""
-        for kept in (self._static, self._labels, self._moving):
+        for kept in (self._static, self._labels, self._moving, self._points, self._carried):
             for other in [key for key in kept if key < frame]:
                 del kept[other]
-        self._points = {key: value for key, value in self._points.items() if key[0] >= frame}
-        self._carried = {key: value for key, value in self._carried.items() if key[1] >= frame}
 
     def own(self, now: Instant) -> Observation:
         """Return the observation by the frame's own scan, whose rays count everywhere."""
@@ -286,13 +286,13 @@ class Merger:
         """
         found = defaultdict[int, list[ClassPoints]](list)
         for other in window:
-            scan, own = self.scan_of(other), other == now.frame
-            if (other, own) not in self._points:
+            scan, kept, own = self.scan_of(other), self._points[other], other == now.frame
+            if own not in kept:
                 all_vote = self.dynamic == "tube" or (own and self.dynamic != "drop")
                 votes = ~self.actors.is_own(scan.points) if all_vote else self.static(other)
-                self._points[other, own] = self._by_class(scan, votes)
+                kept[own] = self._by_class(scan, votes)
             pose = now.grid_T_world @ scan.world_T_sensor
-            for label, seen in self._points[other, own].items():
+            for label, seen in kept[own].items():
                 found[label].append(seen._replace(grid_T_points=pose))
         return [(label, points, *EVERYWHERE) for label, points in found.items()]
 
@@ -407,8 +407,8 @@ class Merger:
         track = self.actors.tracks[number]
         if not track.rigid and abs(self.scan_of(other).seconds - now.seconds) > _DEFORMABLE_S:
             return None
-        key, pose = (number, other), track.pose(other)
-        if key not in self._carried and pose is not None:
+        kept, pose = self._carried[other], track.pose(other)
+        if number not in kept and pose is not None:
             scan = self.scan_of(other)
             own = np.zeros(len(scan.points), np.bool_)
             own[track.members.get(other, [])] = True
@@ -423,8 +423,8 @@ class Merger:
                 ends = np.cumsum([len(points) for points in rays])
                 cast = Cast(np.concatenate(rays), ends, np.stack(places), track.lower, track.upper)
                 points = np.ascontiguousarray(np.concatenate(hits).T)
-                self._carried[key] = _Carried(cast, points)
-        return self._carried.setdefault(key, None)
+                kept[number] = _Carried(cast, points)
+        return kept.setdefault(number, None)
 
 
 @dataclass(frozen=True)

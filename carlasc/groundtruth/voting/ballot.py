@@ -259,10 +259,9 @@ class Ballot:
         from carlasc.groundtruth.voting import kernel
 
         counted = np.zeros(self.spec.num_voxels + 1, kernel.HIT_DTYPE)
+        hit = np.empty(len(counted), np.int32)
         for label, voters, regions, region in seen:
-            points = sum(one.points.shape[1] for one in voters)
-            hit, number = np.empty(min(points, len(counted)), np.int32), 0
-            certain = all(one.sure is None for one in voters)
+            certain, number = all(one.sure is None for one in voters), 0
             doubt = np.zeros(0 if certain else len(counted), np.float32)
             for voter, one in enumerate(voters, 1):
                 pose, sure = as_pose(one.grid_T_points), _ready(one.sure, np.float32)
