@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from carlasc.core.arrays import (
     AnyArray,
+    AnyFloatArray,
     AnyIntArray,
     BoolArray,
     Float32Array,
+    Int32Array,
     IntArray,
     LabelArray,
     Uint8Array,
@@ -376,9 +378,18 @@ class _FrameSteps:
         passing = np.zeros(self.plan.spec.num_voxels, np.int32)
         for other in self.window:
             if other != self.now.frame:
-                grid_T_sensor = self.now.grid_T_world @ self.feed.pose(other)
-                count_points(self.merger.moving(other), grid_T_sensor, self.plan.spec, passing)
+                self._count(self.merger.moving(other), other, passing)
         return np.flatnonzero((passing > 0) & ~self.in_body)
+
+    def _count(
+        self, points: AnyFloatArray, frame: int, counts: Int32Array | None = None
+    ) -> Int32Array:
+        """Return the number of points in each voxel: (N, 3) metres, frame of a scan.
+
+        They are added to (V,) existing counts.
+        """
+        grid_T_sensor = self.now.grid_T_world @ self.feed.pose(frame)
+        return count_points(points, grid_T_sensor, self.plan.spec, counts)
 
     def keep_returns(self, made: _UnfinishedGrid, votes: Votes, consensus: ClassConsensus) -> None:
         """Make voxels with returns of the frame's own scan occupied, unless the returns are
@@ -386,18 +397,15 @@ class _FrameSteps:
         """
         if self.now.frame not in self.window:
             return
-        spec, scan = self.plan.spec, self.feed.read(self.now.frame)
-        points = (
-            scan.points
-            if self.merger.dynamic != "drop"
-            else scan.points[self.merger.static(self.now.frame)]
-        )
+        points = self.feed.read(self.now.frame).points
+        if self.merger.dynamic == "drop":
+            points = points[self.merger.static(self.now.frame)]
         # Other scans may have seen such a voxel free, as a thin object in it stops few rays. A
         # return is an outlier only if very many rays passed; fewer are enough if it is alone.
-        returns = count_points(points, self.now.grid_T_world @ scan.world_T_sensor, spec)
+        returns = self._count(points, self.now.frame)
         returned = np.flatnonzero(returns)
         lost = returned[(made.labels[returned] == 0) & (consensus.labels[returned] > 0)]
-        is_single = (returns[lost] == 1) & ~_have_neighbours(lost, returned, spec)
+        is_single = (returns[lost] == 1) & ~_have_neighbours(lost, returned, self.plan.spec)
         rows = votes.occupied[np.isin(votes.occupied["voxel"], lost)]
         hits = np.bincount(np.searchsorted(lost, rows["voxel"]), rows["votes"], len(lost))
         free = votes.free.reshape(-1)[lost]
@@ -418,18 +426,11 @@ class _FrameSteps:
         path = np.zeros(self.plan.spec.num_voxels, np.int32)
         for other in self.window:
             if other != self.now.frame:
-                count_points(
-                    body, self.now.grid_T_world @ self.feed.pose(other), self.plan.spec, path
-                )
+                self._count(body, other, path)
         voxels = np.flatnonzero((path > 0) & (made.labels > 0))
         solid = ~np.isin(made.labels[voxels], sorted(self.feed.classes.ground))
         there_now = self.in_body  # and where the frame's own scan has points
         if self.now.frame in self.window:
-            scan = self.feed.read(self.now.frame)
-            there_now = there_now | (
-                count_points(
-                    scan.points, self.now.grid_T_world @ scan.world_T_sensor, self.plan.spec
-                )
-                > 0
-            )
+            own = self.feed.read(self.now.frame).points
+            there_now = there_now | (self._count(own, self.now.frame) > 0)
         return voxels[solid & ~there_now[voxels]]
