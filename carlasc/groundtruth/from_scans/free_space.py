@@ -244,11 +244,11 @@ class FreeMap:
             map_T_grid: (4, 4), which may mirror.
             voxels: (M,) flat indices; None: all voxels.
         """
-        chosen = np.arange(self.spec.num_voxels) if voxels is None else voxels
+        chosen = np.empty(0, np.int64) if voxels is None else voxels
+        found = np.empty(self.spec.num_voxels if voxels is None else len(voxels), np.uint32)
         cells_T_grid = map_T_grid.copy()
         cells_T_grid[:3] /= self._cell[:, None]
         pose, cells, volume = as_pose(cells_T_grid), Cells.of(self.spec), float(self._cell.prod())
-        found = np.empty(len(chosen), np.uint32)
         _gather(chosen, pose, cells, self._parts, volume, self._blocks, found)
         return found
 
@@ -379,27 +379,27 @@ def _gather(
     """Sum the counts of the cells in voxels: at places that are evenly spread in each voxel.
 
     Args:
-        voxels: (M,) flat indices. Those above each other are read together.
+        voxels: (M,) flat indices; empty: all voxels. Those above each other are read together.
         pose: cells_T_grid.
         cells: the grid.
         parts: number of cells along the edges of a voxel.
         volume: of a cell.
         blocks: the blocks.
-        found: (M,) output.
+        found: (M,) or (V,) output.
     """
     across, along, up = parts
     size, voxel_size, first = cells.size, cells.voxel_size, blocks.first
     columns, row = np.empty(size[2] * up, np.int64), 0
     rise = voxel_size[2] / up
     stride = pose[2] * rise, pose[6] * rise, pose[10] * rise
-    while row < len(voxels):
-        voxel = voxels[row]
+    while row < len(found):
+        voxel = voxels[row] if len(voxels) else row
         i, j, k = voxel // (size[1] * size[2]), voxel // size[2] % size[1], voxel % size[2]
         height, weight, many = 1, 1.0, along
         while (
-            row + height < len(voxels)
+            row + height < len(found)
             and k + height < size[2]
-            and voxels[row + height] == voxel + height
+            and (len(voxels) == 0 or voxels[row + height] == voxel + height)
         ):
             height += 1
         if cells.cylindrical and along > 1:

@@ -320,7 +320,7 @@ def count_hits(
         voter: number of the voter, from 1: `last` is 0 without one.
         hits: (V + 1,) HIT_DTYPE, 0 without votes; the last element counts points outside.
         doubt: (V + 1,) the summed doubt; empty if all classes are certain.
-        hit: (V + 1,) the voxels with votes, in the order of their first votes.
+        hit: (N,) the voxels with votes, in the order of their first votes.
         number: how many of them there were before.
     """
     view, voxels, begin = view_from(pose, cells), np.empty(BLOCK, np.int32), 0
