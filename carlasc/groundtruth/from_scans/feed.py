@@ -30,7 +30,7 @@ from carlasc.core.scans import Scan, check_finite, lengths, sorted_by_origin
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.groundtruth.from_scans.free_space import FreeSpace
 from carlasc.groundtruth.from_scans.merging import Cast, Instant, Merger, PreparedScan
-from carlasc.groundtruth.inputs import without_caches
+from carlasc.groundtruth.inputs import GridPlan, without_caches
 from carlasc.groundtruth.options import FromScans
 from carlasc.motion import (
     EvidenceScan,
@@ -345,10 +345,10 @@ class ScanFeed:
             self._merger.forget_before(frame + self.options.window[0])
             return self._merger
 
-    def free_space(self, spec: GridSpec, step_m: float, once: bool) -> FreeSpace:
+    def free_space(self, plan: GridPlan) -> FreeSpace:
         """Return the maps of free space, which are kept from frame to frame."""
         first, last = self.options.window
-        corners, map_T_world = _corners(spec), invert(self.pose(int(self.frames[0])))
+        corners, map_T_world = _corners(plan.spec), invert(self.pose(int(self.frames[0])))
 
         def cast_of(frame: int, within_s: float) -> Cast:
             # of all frames, made or not: counts do not depend on which frames are made
@@ -362,9 +362,8 @@ class ScanFeed:
             return self.read(frame).cast(map_T_world, around.min(axis=0), around.max(axis=0))
 
         with self._lock:
-            if self._free is None or self._free.key != (spec, step_m, once):
-                stride = self.options.stride
-                self._free = FreeSpace(spec, step_m, once, map_T_world, stride, cast_of)
+            if self._free is None or self._free.plan != plan:
+                self._free = FreeSpace(plan, map_T_world, self.options.stride, cast_of)
             return self._free
 
     def instant(self, frame: int) -> Instant:

@@ -79,7 +79,7 @@ def merge_frame(
     # Free space comes from maps, in which each ray is followed once for all frames. The frame's own
     # rays count everywhere, and those of other scans outside of bodies, or in the body of an actor.
     regions = BodyRegions.at(merger, now, window, plan.spec)
-    space = feed.free_space(plan.spec, plan.voting.free_step_m, plan.rule == "sensor")
+    space = feed.free_space(plan)
     space.forget_others(merger.actors.tracks)
     steps = _FrameSteps(plan, feed, merger, now, window, regions)
     own = steps.vote([], [merger.own(now)] if frame in window else [])

@@ -22,6 +22,7 @@ from carlasc.core.compiling import cached, inlined, jit
 from carlasc.core.geometry import Transform, invert
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth.from_scans.merging import RECENT_S, Cast, Instant, SeenBody
+from carlasc.groundtruth.inputs import GridPlan
 from carlasc.groundtruth.voting.kernel import BLOCK
 from carlasc.groundtruth.voting.rays import DROPPED, clip, empty_rays, view_from
 
@@ -38,9 +39,8 @@ class FreeSpace:
     """The maps of free space of a drive, which slide with the window of the frames.
 
     Args:
-        spec: the grids.
-        step_m: distance between two samples of a ray, metres.
-        once: count each scan once per voxel, instead of all samples.
+        plan: the grids, and how votes are counted: by the rule "sensor", each scan counts once in a
+            voxel, otherwise all samples.
         map_T_world: (4, 4), which fixes the cells of the static scene.
         stride: frames share scans with every `stride`-th one.
         cast_of: returns the rays of a scan, in the frame of the map, which count in the grids that
@@ -49,14 +49,12 @@ class FreeSpace:
 
     def __init__(
         self,
-        spec: GridSpec,
-        step_m: float,
-        once: bool,
+        plan: GridPlan,
         map_T_world: Transform,
         stride: int,
         cast_of: Callable[[int, float], Cast],
     ) -> None:
-        self.key = spec, step_m, once
+        self.plan = plan
         self._map_T_world, self._stride, self._cast_of = map_T_world, stride, cast_of
         # by the frames that share it, and what is in it: an actor has its number
         self._maps = dict[tuple[int, str | int], FreeMap]()
@@ -68,8 +66,8 @@ class FreeSpace:
         """Return what the rays of a window passed through: counts of each of (M,) voxels.
 
         Args:
-            kind: "scene": samples, or scans with `once`; "views": scans; "recent": samples of scans
-                within `RECENT_S` of a frame.
+            kind: "scene": by the rule of votes; "views": scans; "recent": samples of scans within
+                `RECENT_S` of a frame.
             now: the frame.
             window: frames of the scans.
             voxels: (M,) flat indices; None: all voxels.
@@ -92,10 +90,11 @@ class FreeSpace:
                 free[voxels] += cells.count(actor_T_grid, voxels)
 
     def _map_of(self, kind: str | int, now: Instant) -> FreeMap:
-        key, (spec, step_m, once) = (now.frame % self._stride, kind), self.key
+        key, plan = (now.frame % self._stride, kind), self.plan
         if key not in self._maps:
-            once = kind == "views" or (once and kind != "recent")
-            self._maps[key] = FreeMap(spec, step_m, once, fine=isinstance(kind, int))
+            views = kind == "views" or (plan.rule == "sensor" and kind != "recent")
+            fine, step_m = isinstance(kind, int), plan.voting.free_step_m
+            self._maps[key] = FreeMap(plan.spec, step_m, views, fine=fine)
         return self._maps[key]
 
     def forget_others(self, actors: Collection[int]) -> None:
