@@ -238,7 +238,7 @@ class SeenBody(NamedTuple):
 
 
 class Merger:
-    """Merges the scans of a window into the observations of one frame.
+    """Merges the scans of a window into the votes of one frame.
 
     Args:
         scan_of: returns the prepared scan of a frame.
