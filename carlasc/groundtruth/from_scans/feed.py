@@ -183,13 +183,10 @@ class ScanFeed:
         return self.sequence.frames("points")
 
     @cached_property
-    def _has_times(self) -> bool:
-        return layout.TIMES in self.sequence.documents()
-
-    @cached_property
     def times(self) -> dict[int, float]:
         """Seconds since the first frame, by frame with points."""
-        return {frame: self.time(frame) for frame in self.frames.tolist()}
+        times = self.sequence.times_of(self.frames).tolist()
+        return dict(zip(self.frames.tolist(), times, strict=True))
 
     @property
     def has_labels(self) -> bool:
@@ -372,9 +369,8 @@ class ScanFeed:
 
     def time(self, frame: int) -> float:
         """Return seconds since the first frame."""
-        if self._has_times:
-            return self.sequence.read_time(frame)
-        return frame * layout.FRAME_PERIOD_S
+        known = self.times.get(frame)
+        return float(self.sequence.times_of([frame])[0]) if known is None else known
 
     def read(self, frame: int) -> PreparedScan:
         """Read a scan for merging; the most recent ones are cached."""

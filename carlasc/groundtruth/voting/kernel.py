@@ -64,7 +64,9 @@ of its votes, and the next candidate.
 """
 
 HIT_DTYPE = np.dtype([("votes", np.int32), ("voters", np.uint16), ("last", np.uint16)])
-"""The votes of a voxel for the class, the number of their voters, and the last voter."""
+"""The votes of a voxel for a class, the number of their voters, and the last voter. It is small, as
+there is one for each voxel: a window has less than 65,536 scans.
+"""
 
 
 class Tally(NamedTuple):
