@@ -3,7 +3,7 @@ import pytest
 
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
-from carlasc.groundtruth.voting.ballot import EVERYWHERE, Ballot, ClassPoints, Observation
+from carlasc.groundtruth.voting.ballot import Ballot, ClassPoints, Observation, SeenClass
 
 SPEC = GridSpec("cartesian", (16, 16, 4), (-8, -8, -2), (8, 8, 2))
 
@@ -37,10 +37,10 @@ def test_every_sample_counts_with_the_rule_ray_as_with_sample():
 CYLINDER = GridSpec("cylindrical", (8, 24, 4), (0.0, -np.pi, -2), (8.0, np.pi, 2))
 
 
-def by_class(observations, within=EVERYWHERE, sure=None):
+def by_class(observations, within=(), sure=None):
     """Return the points of observations class by class, each observation a voter."""
     for label in range(1, 12):
-        yield (
+        yield SeenClass(
             label,
             [
                 ClassPoints(

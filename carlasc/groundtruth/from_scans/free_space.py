@@ -81,8 +81,7 @@ class FreeSpace:
     def add_bodies(self, bodies: Iterable[SeenBody], now: Instant, free: Uint32Array) -> None:
         """Add the free samples in the body of each actor to (V,) those of all voxels."""
         for body in bodies:
-            *_, regions, region = body.points
-            voxels = np.flatnonzero(regions == region)
+            voxels = np.flatnonzero(body.points.regions == body.points.region)
             with self._lock:
                 cells = self._map_of(body.number, now)
                 cells.hold(body.casts, body.casts.__getitem__)

@@ -32,7 +32,7 @@ from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import RaysFromPlace, lengths, runs_of_origins
 from carlasc.groundtruth.options import Dynamic
-from carlasc.groundtruth.voting.ballot import EVERYWHERE, ClassPoints, Observation, SeenClass
+from carlasc.groundtruth.voting.ballot import ClassPoints, Observation, SeenClass
 from carlasc.motion import BODY_MARGIN_M
 from carlasc.motion.tracks import MovingActors, Track
 from carlasc.storage import layout
@@ -294,7 +294,7 @@ class Merger:
             pose = now.grid_T_world @ scan.world_T_sensor
             for label, seen in kept[own].items():
                 found[label].append(seen._replace(grid_T_points=pose))
-        return [(label, points, *EVERYWHERE) for label, points in found.items()]
+        return [SeenClass(label, points) for label, points in found.items()]
 
     def _by_class(self, scan: PreparedScan, votes: BoolArray) -> dict[int, ClassPoints]:
         """Return the points of a scan that vote, (N,) bool, by class; their poses are not set."""
@@ -334,7 +334,7 @@ class Merger:
                         casts[other] = carried.cast
                         points.append(ClassPoints(carried.points, grid_T_actor))
             if casts:
-                votes = track.label, points, regions.of_voxel, region
+                votes = SeenClass(track.label, points, regions.of_voxel, region)
                 yield SeenBody(number, pose, casts, votes)
 
     def moving(self, frame: int) -> Float32Array:
@@ -357,7 +357,7 @@ class Merger:
             if len(track.surface) and pose is not None:
                 surface = np.ascontiguousarray(track.surface.T)
                 points = [ClassPoints(surface, now.grid_T_world @ pose)]
-                yield track.label, points, regions.of_voxel, region
+                yield SeenClass(track.label, points, regions.of_voxel, region)
 
     def static(self, frame: int) -> BoolArray:
         """Return (N,) bool: the points of a scan that belong to no moving actor.

@@ -114,11 +114,23 @@ class ClassPoints(NamedTuple):
     sure: Float32Array | None = None
 
 
-SeenClass = tuple[int, Sequence[ClassPoints], Uint16Array, int]
-"""A class, the points of each voter, the (V,) region of each voxel, and the region whose voxels
-count; without regions, all do.
-"""
-EVERYWHERE = np.empty(0, np.uint16), 0
+_EVERYWHERE = np.empty(0, np.uint16)
+
+
+class SeenClass(NamedTuple):
+    """The points of one class, and where they vote.
+
+    Attributes:
+        label: the class.
+        voters: the points that each voter saw.
+        regions: (V,) region of each voxel; empty: the points vote in all voxels.
+        region: the region in whose voxels they vote.
+    """
+
+    label: int
+    voters: Sequence[ClassPoints]
+    regions: Uint16Array = _EVERYWHERE
+    region: int = 0
 
 
 def count_votes(
@@ -249,7 +261,7 @@ class Ballot:
             voting = observation.labels > 0
             for pose, begin, end in zip(cast.poses, [0, *ends], ends, strict=False):
                 points = observation.points[begin:end][voting[begin:end]]
-                self._widen(points.T, as_pose(pose.reshape(3, 4)), *EVERYWHERE)
+                self._widen(points.T, as_pose(pose.reshape(3, 4)))
         # Each origin of rays is a voter, with a number of its own: `once` compares these numbers.
         self.num_observations += len(ends)
 
@@ -273,7 +285,9 @@ class Ballot:
             self._make_room(number)
             kernel.add_hits(label, counted, doubt, hit[:number], regions, region, self._tally)
 
-    def _widen(self, points: Float32Array, pose: Pose, regions: Uint16Array, region: int) -> None:
+    def _widen(
+        self, points: Float32Array, pose: Pose, regions: Uint16Array = _EVERYWHERE, region: int = 0
+    ) -> None:
         from carlasc.groundtruth.voting import filled
 
         if self._boxes is not None:
