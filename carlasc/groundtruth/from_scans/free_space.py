@@ -31,7 +31,7 @@ _EDGE = 1 << _BITS
 # About the height of a cell, as most rays graze the ground, and its width in the map of an actor.
 # With wider ones, pedestrians lose: see docs/studies/rays.md.
 _CELL_M = 0.05
-_MOST = 8  # greatest number of cells along an edge of a voxel; the least is 2
+_MOST = 8  # greatest number of cells along an edge of a voxel, as in those of 0.4 m; least: 2
 _FEWEST = 256  # least number of blocks by which a map grows
 
 
@@ -110,7 +110,7 @@ class _Blocks(NamedTuple):
     Attributes:
         first: (3,) the first block of `slots` along each axis.
         slots: (X, Y, Z) index of each block in `counts`; -1 without one.
-        unused: (B,) indices that are not in use.
+        unused: (U,) indices; the first ones are of blocks that are not in use.
         left: (1,) how many of them there are.
         counts: (B, cells) samples in each cell.
         stamps: (B, cells) the last scan that was added or removed; empty if every sample counts.
@@ -163,7 +163,7 @@ class FreeMap:
             cast_of: returns the rays of a scan.
         """
         others = [scan for scan in self._held if scan not in scans]
-        if 2 * len(others) > len(self._held):  # begin anew, which is faster
+        if 2 * len(others) > len(self._held):  # adding the rest anew costs less than removing these
             self._clear()
         else:
             for scan in others:
