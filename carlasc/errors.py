@@ -20,7 +20,9 @@ from functools import cache
 from itertools import groupby
 from numbers import Integral, Real
 from types import FrameType, ModuleType, UnionType
-from typing import Any, Self, Union, get_args, get_origin, get_type_hints
+from typing import Any, Self, TypeVar, Union, get_args, get_origin, get_type_hints
+
+T = TypeVar("T")
 
 _USER = re.compile(r"(?<=://)[^/\s@'\"]+@")  # user:password
 # Characters that control a terminal or change the order of a line: control characters (ESC starts
@@ -43,7 +45,8 @@ class CarlascError(Exception):
     EXPECTED, found FOUND: ADVICE`.
 
     Attributes:
-        where: place of the error: a file, a URL, a field, or the name of an argument.
+        where: place of the error: a file, a URL, a field, or the name of an argument; what has a
+            location, such as a source, is named by it.
         problem: what went wrong, if "expected ..., found ..." is not sufficient.
         expected: the expected value or state.
         found: the actual value or state.
@@ -60,7 +63,7 @@ class CarlascError(Exception):
         found: str = "",
         advice: str = "",
     ) -> None:
-        shown = without_credentials(str(where))
+        shown = without_credentials(str(getattr(where, "location", where)))
         super().__init__(
             shown
             # the only positional argument, so that errors can be pickled: other attributes are in
@@ -147,6 +150,16 @@ def reading(where: object, expected: str, advice: str = "") -> Iterator[None]:
         raise FormatError(
             where, expected=expected, found=f"something else ({describe(error)})", advice=advice
         ) from error
+
+
+def tried_twice(read: Callable[[], T]) -> T | None:
+    """Return what a call reads; None if it fails twice. A temporary error, such as one of a network
+    file system, is not taken for missing data.
+    """
+    for _ in range(2):
+        with suppress(CarlascError, OSError):
+            return read()
+    return None
 
 
 @contextmanager
@@ -390,13 +403,14 @@ def plugin_names(group: str) -> tuple[str, ...]:
     return tuple(sorted({entry.name for entry in entry_points(group=group)}))
 
 
-def load_plugin(group: str, name: str, base: type | None = None) -> Any:
+def load_plugin(group: str, name: str, base: type | None = None, argument: str = "name") -> Any:
     """Load what an entry point names.
 
     Args:
         group: an entry-point group, such as "carlasc.converters".
         name: name of the entry point.
         base: the class that it must inherit; None if it may be anything.
+        argument: of the caller, that has the name.
 
     Raises:
         ArgumentError: the group has no such name.
@@ -407,7 +421,7 @@ def load_plugin(group: str, name: str, base: type | None = None) -> Any:
     entries = {entry.name: entry for entry in entry_points(group=group)}
     if name not in entries:
         expected = f"one of {', '.join(sorted(entries)) or 'no names: none is installed'}"
-        raise ArgumentError("name", expected=expected, found=repr(name))
+        raise ArgumentError(argument, expected=expected, found=repr(name))
     where = f"{group.removeprefix('carlasc.').removesuffix('s')} {name} ({entries[name].value})"
     try:
         plugin = entries[name].load()

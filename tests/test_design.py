@@ -87,6 +87,7 @@ def counted(tmp_path_factory):
     return cases(tmp_path_factory.mktemp("entered"))
 
 
+@pytest.mark.slow
 @pytest.mark.needs("trimesh", "embreex", "rosbags")
 @pytest.mark.parametrize("case", MOST_FILES)
 def test_a_frame_passes_through_few_files(counted, case):
@@ -124,6 +125,7 @@ def test_nothing_outside_of_transport_sends_a_request():
             assert not found, f"{path.relative_to(ROOT)} imports {', '.join(sorted(found))}"
 
 
+@pytest.mark.slow
 def test_converters_and_recorders_are_found_by_entry_points_only():
     for path in PACKAGE.rglob("*.py"):
         tree = ast.parse(path.read_text())

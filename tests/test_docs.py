@@ -204,6 +204,7 @@ def command_lines():
                 yield page, found[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("page", "line"), sorted(set(command_lines())))
 def test_commands_in_the_docs_have_the_options_that_they_are_given(page, line):
     name, *arguments = shlex.split(line, comments=True)[1:]
@@ -342,6 +343,7 @@ def quoted_errors():
             yield page, re.split(r", found |\.\.\.", text)[0].strip()
 
 
+@pytest.mark.slow
 def test_error_messages_that_are_quoted_exist():
     quoted = sorted(set(quoted_errors()))
     patterns = [re.compile(pattern) for pattern in messages("expected")]

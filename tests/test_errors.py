@@ -30,6 +30,7 @@ from carlasc.errors import (
     printable,
     reading,
 )
+from carlasc.storage.folder import FolderSource
 
 KINDS = (FormatError, MissingDataError, DependencyError, ArgumentError, ConflictError, StorageError)
 
@@ -285,3 +286,8 @@ def test_a_noun_agrees_with_its_number(arguments, text):
 def test_names_after_the_first_few_are_counted():
     assert first_names(["a", "b", "c"], most=2) == "a, b and 1 more"
     assert first_names(["a", "b"], most=2) == "a, b"
+
+
+def test_a_source_is_named_by_its_location(tmp_path):
+    source = FolderSource(tmp_path)
+    assert MissingDataError(source, expected="x").where == str(tmp_path)

@@ -85,6 +85,7 @@ def check_help(extras):
     assert [line.split()[0] for line in ran.stdout.splitlines()] == MODULES
 
 
+@pytest.mark.slow
 def test_help_works_in_a_base_installation():
     assert "pytest" in hidden_without(()) and "numpy" not in hidden_without(())
     check_help(())

@@ -52,6 +52,7 @@ def downloads(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", [HOWTO, README], ids=lambda path: path.name)
 def test_the_quick_start_makes_one_training_step_in_ten_lines(path, downloads):
     snippet = quick_start(path)
@@ -68,6 +69,7 @@ def test_the_quick_start_makes_one_training_step_in_ten_lines(path, downloads):
     assert names["optimizer"].state[next(network.parameters())]["step"] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.needs("zarr", "urllib3")
 def test_the_how_to_runs_from_top_to_bottom(downloads, capsys, tmp_path):
     names: dict = {}

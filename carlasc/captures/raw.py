@@ -11,10 +11,11 @@ cameras.json  images/{camera}/{f}.jpg, and the other folders of images
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import PurePosixPath
 
 import numpy as np
 
@@ -384,12 +385,13 @@ class Capture:
         return f"<Capture {self.location}>"
 
 
-def find_captures(source: AnyPath) -> dict[str, Capture]:
+def find_captures(source: AnyPath, places: Sequence[str] = ("",)) -> dict[str, Capture]:
     """Find the captures in a folder.
 
     Args:
         source: a path or a URL: the folder of a sequence with raw/ in it, raw/ itself, or a folder
             up to three levels above such sequences.
+        places: folders in it that are searched.
 
     Returns:
         Captures by the path of their sequence relative to `source`, in sorted order. The path is ""
@@ -407,7 +409,10 @@ def find_captures(source: AnyPath) -> dict[str, Capture]:
         or tree.location.rstrip("/").rpartition("/")[2] == RAW
     ):
         return {"": Capture(tree)}
-    paths = sorted(_find(tree, "", _SEARCH_DEPTH))
+    paths = list[str]()
+    for place in places:
+        depth = _SEARCH_DEPTH - len(PurePosixPath(place).parts)
+        paths += _find(tree, place, max(depth, 0))
     if not paths:
         raise MissingDataError(
             tree.location,
@@ -415,7 +420,7 @@ def find_captures(source: AnyPath) -> dict[str, Capture]:
             found=f"none within {_SEARCH_DEPTH} levels of folders",
             advice="give the folder of a sequence with raw/ in it, or a folder of such sequences",
         )
-    return {path: Capture(tree.below(path)) for path in paths}
+    return {path: Capture(tree.below(path)) for path in sorted(paths)}
 
 
 def _find(tree: Tree, path: str, depth: int) -> Iterator[str]:

@@ -30,7 +30,7 @@ def load_recorder(name: str, base: type | None = None) -> Any:
         ArgumentError: no recorder has that name.
         DependencyError: it cannot be loaded, or does not inherit `base`.
     """
-    return load_plugin(GROUP, name, base)
+    return load_plugin(GROUP, name, base, "simulator" if base else "name")
 
 
 def __getattr__(name: str) -> Any:

@@ -4,6 +4,7 @@ prints its result.
 
 from __future__ import annotations
 
+import atexit
 import importlib
 import os
 import signal
@@ -166,6 +167,8 @@ def _root(
 
 def main() -> None:
     """Run the command line: the entry point `carlasc`."""
+    # the last thing that Python does before it takes its modules apart, without handlers of signals
+    atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
     if sys.stderr is not None and sys.stderr.isatty():  # on terminals only, like progress bars
         note_compiling(say_compiling)
     try:

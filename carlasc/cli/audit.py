@@ -17,7 +17,7 @@ from carlasc.cli.common import (
     print_json,
     show,
 )
-from carlasc.cli.flags import RunFlags
+from carlasc.cli.flags import OneWorkerRunFlags
 from carlasc.cli.library import Given, Library
 from carlasc.errors import count
 
@@ -29,7 +29,7 @@ _COLORS = {"fault": "red", "undetermined": "yellow", "sound": "green"}
 
 def audit(
     *,
-    work: RunFlags,
+    work: OneWorkerRunFlags,
     grids: Annotated[
         str,
         place_argument(
@@ -70,7 +70,7 @@ def audit(
     else:
         _print(result, everything=everything)
     for failure in result.failures:
-        echo(f"{failure.where}: frame {failure.frame}: {failure.message}", err=True)
+        echo(f"carlasc: {failure.where}: frame {failure.frame}: {failure.message}", err=True)
     if not result.ok:
         raise typer.Exit(FAILED)
 

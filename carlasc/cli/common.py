@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 _Number = TypeVar("_Number", int, float)
 
+MANY, WORST = 100, 10  # of more sequences or grids, sums and the worst are printed
 _LINE_S = 10.0  # time between two lines of progress without a terminal, seconds
 FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
 

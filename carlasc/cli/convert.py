@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Final, Literal
 
 import typer
@@ -13,7 +12,6 @@ from carlasc.cli.common import (
     Json,
     as_typed,
     echo,
-    file_argument,
     place_argument,
     print_frames,
     print_json,
@@ -85,7 +83,12 @@ def convert(
         ),
     ],
     source: Annotated[
-        Path, file_argument("Folder of the data set, or of one of its sequences.", "SOURCE")
+        str,
+        place_argument(
+            "Folder of the data set, or of one of its sequences. With --sequences-from: folder or "
+            "URL of clips.",
+            "SOURCE",
+        ),
     ],
     out: Annotated[str, place_argument("Folder to write to, or its URL.", "OUT")],
     sequences: Annotated[
@@ -146,7 +149,7 @@ def convert(
             "--grids", expected="scans, because options of the grid are given", found=grids
         )
     bounded = making.grid.bounds is not None
-    if run.part is not None and grids == "scans" and not bounded:
+    if (run.part or run.sequences_from) and grids == "scans" and not bounded:
         raise ArgumentError(
             "--part",
             expected="--bounds or --grids none, because the height of the grid is otherwise "

@@ -10,11 +10,14 @@ from carlasc.errors import count
 
 
 def finish(
-    out: Annotated[str, place_argument("The .zarr store that was written in parts.", "OUT")],
+    out: Annotated[
+        str, place_argument("The folder or the .zarr store that was written in parts.", "OUT")
+    ],
     options: Annotated[Given, Library("carlasc.finish")],
     json: Json = False,
 ) -> None:
-    """Finish a .zarr store that was written in parts, so that it can be opened.
+    """Check that an output that was written in parts is complete, and finish a .zarr store, so that
+    it can be opened.
 
     The last part of a run does this automatically. Use this command if a part failed, or was never
     run.

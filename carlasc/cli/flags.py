@@ -213,16 +213,7 @@ class WorkFlags(Flags):
 
 
 @dataclass(frozen=True)
-class OneWorkerFlags(WorkFlags):
-    """How work is spread; by default, one process does it."""
-
-    workers: Annotated[
-        int | None, typer.Option(help="Number of parallel processes. Default: one.", min=1)
-    ] = None
-
-
-@dataclass(frozen=True)
-class RunFlags(WorkFlags):
+class PartFlags(WorkFlags):
     """How work is spread, also over several commands."""
 
     part: Annotated[
@@ -238,3 +229,35 @@ class RunFlags(WorkFlags):
         from carlasc.running.spreading import Part
 
         return {} if self.part is None else {"part": Part.parse(self.part)}
+
+
+@dataclass(frozen=True)
+class RunFlags(PartFlags):
+    """How work is spread, also over several commands, of which each may do some sequences."""
+
+    sequences_from: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE",
+            help="Work on the sequences whose folders below SOURCE this file lists, one per line. "
+            "If it does not exist, it is written, so that other parts need not list SOURCE.",
+        ),
+    ] = None
+
+    def _part(self) -> dict[str, Any]:
+        listed = self.sequences_from
+        return super()._part() | ({} if listed is None else {"sequences_from": listed})
+
+
+@dataclass(frozen=True)
+class OneWorkerFlags(WorkFlags):
+    """How work is spread; by default, one process does it."""
+
+    workers: Annotated[
+        int | None, typer.Option(help="Number of parallel processes. Default: one.", min=1)
+    ] = None
+
+
+@dataclass(frozen=True)
+class OneWorkerRunFlags(OneWorkerFlags, RunFlags):
+    """As `OneWorkerFlags`, also over several commands."""

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated
 
-import carlasc
-from carlasc.cli.common import Json, console, line, place_argument, print_json, show
+import typer
+
+from carlasc.cli.common import MANY, WORST, Json, console, line, place_argument, print_json, show
+from carlasc.cli.library import Given, Library
 from carlasc.errors import count
 
 if TYPE_CHECKING:
@@ -13,18 +15,24 @@ if TYPE_CHECKING:
 
 
 def info(
+    *,
     source: Annotated[
         str,
         place_argument(
             "A data set, a split, a sequence, a zip, a packed store, a capture, or a URL."
         ),
     ] = ".",
+    options: Annotated[Given, Library("carlasc.info")],
+    everything: Annotated[
+        bool, typer.Option("--all", help="Look at all sequences, and print a row for each.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """List the contents of a data set: splits, sequences, frames, fields, grids and how they were
-    made. No frame is read.
+    made. No frame is read. Of more than 100 sequences, some are looked at.
     """
-    overview = carlasc.info(source)
+    given = {} if everything else {"sample": MANY, **options.values}
+    overview = options.make(source, **given)
     if as_json:
         print_json(overview.to_dict())
     else:
@@ -41,7 +49,15 @@ def _print(overview: Overview) -> None:
     console().print(
         line(overview.location, "bold") + line(f": {overview.level} ({overview.store})")
     )
-    if overview.sequences:
+    if overview.places:
+        frames, taken = overview.total("frames"), overview.total("bytes")
+        show(f"{count(sum(overview.places.values()), 'sequence')}{splits}")
+        show(
+            f"{len(overview.sequences)} looked at (--all: all): in all {frames.value:,.0f} frames "
+            f"({frames.low:,.0f} to {frames.high:,.0f}), {_size(round(taken.value))} "
+            f"({_size(round(taken.low))} to {_size(round(taken.high))})"
+        )
+    elif overview.sequences:
         size = f", {_size(overview.bytes)}" if overview.bytes is not None else ""
         show(f"{count(len(overview.sequences), 'sequence')}{splits}{size}")
         header = (
@@ -56,9 +72,9 @@ def _print(overview: Overview) -> None:
             "Size",
         )
         print_table(header, [_row(sequence) for sequence in overview.sequences], turn=False)
-    for sequence in overview.sequences:
-        if sequence.problem:
-            show(f"{sequence.path or sequence.name}: {sequence.problem}")
+    bad = [sequence for sequence in overview.sequences if sequence.problem]
+    for sequence in bad[:WORST] if overview.places else bad:
+        show(f"{sequence.path or sequence.name}: {sequence.problem}")
     if kinds := _kinds_of_grids(overview):
         header = (
             "Grid",

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from carlasc.cli.common import (
+    MANY,
+    WORST,
     Json,
     SourceArgument,
     echo,
@@ -38,7 +40,7 @@ def report(
         ),
     ] = None,
     everything: Annotated[
-        bool, typer.Option("--all", help="Print all actors, not only the first twelve.")
+        bool, typer.Option("--all", help="Print all grids and actors, not only the first.")
     ] = False,
     as_json: Json = False,
 ) -> None:
@@ -67,7 +69,14 @@ def report(
 def _print(result: ReportResult, *, everything: bool) -> None:
     from carlasc.inspection.report_page import describe
 
-    for name, one in result.reports.items():
+    shown = [*result.reports.items()]
+    if len(shown) > MANY and not everything:
+        frames = sum(len(one.frames) for _, one in shown)
+        known = sum(one.coverage.known for _, one in shown)
+        share = known / max(sum(one.coverage.voxels for _, one in shown), 1)
+        show(f"{len(shown)} grids, {frames:,} frames, {share:.1%} known; those with least known:")
+        shown = sorted(shown, key=lambda row: row[1].coverage.known_share)[:WORST]
+    for name, one in shown:
         show(name, "bold")
         rows = describe(one)
         width = max(len(label) for label, _ in rows)

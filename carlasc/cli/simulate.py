@@ -10,7 +10,7 @@ import typer
 import carlasc
 from carlasc.cli.capture import CamerasOption, OutArgument, SensorFlags, camera_names
 from carlasc.cli.common import Json, print_frames, print_json, show
-from carlasc.cli.flags import RunFlags
+from carlasc.cli.flags import PartFlags
 from carlasc.cli.grid_flags import GridFlags
 from carlasc.errors import count as count_of  # `count` is an option
 
@@ -32,7 +32,7 @@ def simulate(
     grid: GridFlags,
     json: Json = False,
     sensors: SensorFlags,
-    run: RunFlags,
+    run: PartFlags,
 ) -> None:
     """Simulate a drive through a town, and write a raw capture (the scans of all sensors), or scans
     and ground truth.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
@@ -10,6 +11,8 @@ import typer
 import carlasc
 from carlasc.cli.common import (
     FAILED,
+    MANY,
+    WORST,
     Json,
     SourceArgument,
     print_json,
@@ -71,7 +74,7 @@ def validate(
     ] = False,
     everything: Annotated[
         bool,
-        typer.Option("--all", help="Print all findings, not only the first three of each kind."),
+        typer.Option("--all", help="Print all findings and sequences, not only the first."),
     ] = False,
     as_json: Json = False,
     holdout: HoldoutFlags,
@@ -141,7 +144,12 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
             show(f"  {finding}")
         if len(findings) > len(shown):
             show(f"  ... and {len(findings) - len(shown)} more (--all prints them)")
-    for report in result.sequences:
+    reports, found = result.sequences, Counter(finding.sequence for finding in result.findings)
+    if len(reports) > MANY and not everything:
+        frames = sum(report.frames for report in reports)
+        show(f"{len(reports)} sequences, {count(frames, 'frame')}; those with most findings:")
+        reports = tuple(sorted(reports, key=lambda report: -found[report.path])[:WORST])
+    for report in reports:
         figures = [
             f"{share:.1%} of points in voxels of their class ({grid})"
             for grid, share in report.voxel_share.items()

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import time
-from collections.abc import Collection, Generator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
@@ -50,7 +51,6 @@ from carlasc.storage.files import (
 )
 from carlasc.storage.folder import FolderWriter
 from carlasc.storage.inputs import (
-    UNKNOWN,
     MadeFrom,
     SequenceFiles,
     combined,
@@ -58,6 +58,8 @@ from carlasc.storage.inputs import (
     describe_changes,
     made_again,
 )
+from carlasc.storage.layout import identity_of
+from carlasc.storage.shares import Share, source_in
 
 RECORD = "carlasc-export.json"
 """The file in a folder that records its exports."""
@@ -144,24 +146,27 @@ def export(
         )
     opened = storage.as_source(source)
     check_outside(root, opened.location)
-    every = _by_name(opened)
+    share = Share(opened, run)
+    every = _by_name(share)
     # of all sequences: names of folders do not depend on the choice
-    folders = exporter.folders(list(every))
+    places = sorted(f"{place}/cartesian" for place in (*share.own, *share.others))
+    names = [identity_of(place)[1] for place in places] if share.others else [*every]
+    folders = exporter.folders(names)
     chosen, notes = [], []
-    for sequence in _choose(every, sequences, opened.location):
+    for sequence in _choose(every, names, sequences, opened.location):
         notes += exporter.check(sequence)
-        chosen.append(Exported(sequence, folders[sequence.name], tuple(exporter.frames(sequence))))
+        chosen.append(_exported(exporter, sequence, folders))
         if not chosen[-1].frames:
             notes.append(f"{sequence.location} has no frame to export")
     record = ExportRecord(root, name, exporter.product)
-    places = {_place(exporter, exported): exported.sequence for exported in chosen}
+    own = {_place(exporter, exported): exported.sequence for exported in chosen}
     if not overwrite:
-        record.check(places, exporter.settings)
-    record.write(places, exporter.settings)
+        record.check(own, exporter.settings)
+    record.write(own, exporter.settings)
     remove_stale(root)
-    ours = _deal(exporter, chosen, run.part)
+    ours = _deal(exporter, chosen, share.run.part)
     steps = StepCounter(run.progress, sum(len(exported.frames) for exported in ours))
-    with one_pool(run) as pooled:
+    with one_pool(share.run) as pooled:
         writing = _SequenceExport(exporter, root, overwrite, pooled, steps)
         for exported in ours:
             label = f"export-{name}-{exporter.product}/{_place(exporter, exported)}"
@@ -176,16 +181,26 @@ def export(
             elif inputs.is_known or not exists:
                 inputs.write()
             elif not overwrite and compare_inputs != "never":
-                notes.append(f"{root / exported.folder}: {UNKNOWN}")
+                notes.append(f"{root / exported.folder}: {_UNKNOWN}")
             failed = len(writing.failures)
             writing.add(exported, again=inputs.changed)
             # otherwise, frames of before may still be there
             if len(writing.failures) == failed and (inputs.is_known or overwrite):
                 inputs.write()
-    if run.part.count == 1 or all(
-        _is_whole(exporter, exported, root / exported.folder) for exported in chosen
-    ):
-        index = exporter.index(root, writing.exported if run.part.count == 1 else chosen)
+    indexed: Sequence[Exported] | None = writing.exported
+    if run.part.count > 1:
+        others = (
+            _exported(exporter, sequence, folders)
+            for place in share.others
+            for sequence in _by_name(source_in(opened, [place])).values()
+            if sequences is None or sequence.name in sequences
+        )
+        indexed = _all_whole(exporter, root, itertools.chain(chosen, others))
+    if indexed is not None:
+        indexed = sorted(indexed, key=lambda exported: names.index(exported.sequence.name))
+        own = {_place(exporter, exported): exported.sequence for exported in indexed}
+        record.write(own, exporter.settings)  # other parts may have replaced it
+        index = exporter.index(root, indexed)
         write_many({root / file: data for file, data in index.items()})
     written = sum(len(exported.frames) for exported in writing.exported)
     return ExportResult(
@@ -227,15 +242,24 @@ def _by_name(source: storage.Source) -> dict[str, storage.Sequence]:
 
 
 def _choose(
-    by_name: Mapping[str, storage.Sequence], wanted: Collection[str] | None, location: str
+    by_name: Mapping[str, storage.Sequence],
+    names: Collection[str],
+    wanted: Collection[str] | None,
+    location: str,
 ) -> list[storage.Sequence]:
-    if wanted is not None and (unknown := [name for name in wanted if name not in by_name]):
+    if wanted is not None and (unknown := [name for name in wanted if name not in names]):
         raise MissingDataError(
             location,
             expected=f"the sequences {', '.join(unknown)}",
-            found=f"only {', '.join(by_name)}",
+            found=f"only {', '.join(names)}",
         )
     return [sequence for name, sequence in by_name.items() if wanted is None or name in wanted]
+
+
+def _exported(
+    exporter: Exporter, sequence: storage.Sequence, folders: Mapping[str, str]
+) -> Exported:
+    return Exported(sequence, folders[sequence.name], tuple(exporter.frames(sequence)))
 
 
 def _place(exporter: Exporter, exported: Exported) -> str:
@@ -264,6 +288,16 @@ def _deal(exporter: Exporter, chosen: Sequence[Exported], part: Part) -> list[Ex
     return [exported for exported in ours if exported.frames or part.count == 1]
 
 
+def _all_whole(exporter: Exporter, root: Path, every: Iterable[Exported]) -> list[Exported] | None:
+    """Return sequences if all of them are exported; the first that is not ends the search."""
+    found = list[Exported]()
+    for exported in every:
+        if not _is_whole(exporter, exported, root / exported.folder):
+            return None
+        found.append(exported)
+    return found
+
+
 def _is_whole(exporter: Exporter, exported: Exported, folder: Path) -> bool:
     """Whether all frames of a sequence are exported."""
     sequence = exported.sequence
@@ -276,16 +310,18 @@ def _is_whole(exporter: Exporter, exported: Exported, folder: Path) -> bool:
 
 def _exists(exporter: Exporter, sequence: storage.Sequence, frame: int, folder: Path) -> bool:
     """Whether all files of a frame exist, or the file of its sequence."""
-    files = (
-        exporter.frame_files(sequence, frame)
-        if isinstance(exporter, FrameExporter)
-        else (exporter.file(sequence),)
-        if isinstance(exporter, SequenceExporter)
-        else ()
-    )
+    files: Iterable[str] = ()
+    if isinstance(exporter, FrameExporter):
+        files = exporter.frame_files(sequence, frame)
+    elif isinstance(exporter, SequenceExporter):
+        files = (exporter.file(sequence),)
     return all(has_content(folder / file) for file in files)
 
 
+_UNKNOWN = (
+    "there is no record of what existing frames were made from: they are kept; "
+    '`compare_inputs="content"` compares them'
+)
 _TEXTS = "-1"  # in the place of a frame: files that belong to no single frame
 
 
@@ -532,9 +568,10 @@ class ExportRecord:
 
     def __init__(self, root: Path, name: str, product: str) -> None:
         self._path, self._name, self._product = root / RECORD, name, product
-        self._all = (
-            parse_json(self._path.read_bytes(), str(self._path)) if has_content(self._path) else {}
-        )
+
+    def _read(self) -> dict[str, Any]:
+        path = self._path
+        return parse_json(path.read_bytes(), str(path)) if has_content(path) else {}
 
     def check(self, sequences: Mapping[str, storage.Sequence], settings: Mapping[str, Any]) -> None:
         """Check that the places of sequences in the folder are new, or hold the same sequences,
@@ -543,7 +580,7 @@ class ExportRecord:
         Raises:
             ConflictError: a place holds something else.
         """
-        known, wanted = self._all.get(self._name, {}).get(self._product, {}), _plain(settings)
+        known, wanted = self._read().get(self._name, {}).get(self._product, {}), _plain(settings)
         for place, sequence in sequences.items():
             record = known.get(place)
             if record is None:
@@ -566,12 +603,14 @@ class ExportRecord:
 
     def write(self, sequences: Mapping[str, storage.Sequence], settings: Mapping[str, Any]) -> None:
         """Add sequences to the record, by their places."""
-        part = self._all.setdefault(self._name, {}).setdefault(self._product, {})
+        every = self._read()
+        part = every.setdefault(self._name, {}).setdefault(self._product, {})
         part |= {
             place: {"sequence": s.path, "settings": _plain(settings)}
             for place, s in sequences.items()
         }
-        write_atomic(self._path, to_json(self._all))
+        every[self._name][self._product] = dict(sorted(part.items()))
+        write_atomic(self._path, to_json(every))
 
 
 def _plain(settings: Mapping[str, Any]) -> Any:

@@ -23,7 +23,7 @@ from carlasc.motion.options import MotionOptions, PoseOptions
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
 from carlasc.storage.derived_copies import check_complete
-from carlasc.storage.files import AnyPath
+from carlasc.storage.files import AnyPath, remove_stale_of
 from carlasc.storage.folder import FolderWriter
 from carlasc.storage.inputs import MadeFrom, combined, sequence_states
 from carlasc.storage.protocol import Source
@@ -42,11 +42,14 @@ class MapExtras:
             OUT_actors, and their poses to actors.json.
         mesh: file of the surface of the occupied cells, with classes as colours: .ply or .glb.
         distance: with `grid`: .npz file of the distance of each voxel from the surface.
+        trajectory: file of the pose of the sensor in the map at each scan, in the format of TUM:
+            seconds since the first frame, position, quaternion x, y, z, w.
     """
 
     actors: bool = False
     mesh: AnyPath | None = None
     distance: AnyPath | None = None
+    trajectory: AnyPath | None = None
 
     def __post_init__(self) -> None:
         check_types(MapExtras, vars(self))
@@ -161,7 +164,8 @@ def map(
         )
     if run.part.count > 1:
         raise ArgumentError("part", expected="none, as a map is one file", found=str(run.part))
-    files = MapFiles.of(out, extras.mesh, extras.distance, extras.actors, grid)
+    extra = {"mesh": extras.mesh, "distance": extras.distance, "trajectory": extras.trajectory}
+    files = MapFiles.of({"out": out, **extra}, extras.actors, grid)
     wanted, keep, options = FrameRange.of(frames), recording.keep, recording.options
     root, reader = None, None
     if (
@@ -182,14 +186,21 @@ def map(
     first, settings = files.all[0], (cell_m, str(wanted), grid, [str(path) for path in files.all])
     record = MadeFrom(combined(settings, motion, poses, sorted(states.items())))
     keeper, kept = FolderWriter(first.parent), f"map-{first.name}"
+    is_ours, place = MadeFrom.read(keeper, kept) == record, first.parent / layout.DERIVED
+    place /= f"recording-{first.name}"
+    for path in (first, first.parent / layout.record_file(kept)):
+        remove_stale_of(path)
     if not overwrite and all(path.exists() for path in files.all):
-        check_complete(first, MadeFrom.read(keeper, kept) == record)
-    files.check(overwrite)
+        if is_ours:  # a run that was killed at its end leaves it
+            shutil.rmtree(place, ignore_errors=True)
+        check_complete(first, is_ours)
+    files.check(overwrite or is_ours)
+    if not overwrite:  # so that the next run continues one that is killed
+        files = replace(files, begin=lambda: record.write(keeper, kept))
 
     made, steps = None, StepCounter(run.progress)
     if root is not None and reader is not None:
         check_outside(first, str(root))
-        place = first.parent / layout.DERIVED / f"recording-{first.name}"
         made = convert(
             reader,
             root,

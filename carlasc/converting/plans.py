@@ -115,6 +115,7 @@ class RecordingPlan(Examined):
             actors.
         again: whether all frames are made again and compared with those in the output, because the
             data set changed.
+        is_same: whether it is the same data set nevertheless: some of its files are as they were.
     """
 
     writer: SequenceWriter
@@ -128,10 +129,12 @@ class RecordingPlan(Examined):
     missing: set[int] = field(default_factory=set)
     unfinished: set[int] = field(default_factory=set)
     again: bool = False
+    is_same: bool = False
 
-    def make_again(self) -> None:
+    def make_again(self, *, is_same: bool) -> None:
         """Make all frames again, because the data set changed."""
         numbers = {handle.number for handle in self.recording.frames}
+        self.is_same = is_same
         self.again, self.missing, self.unfinished = True, numbers, set(numbers)
 
     def take_estimate(self, first_T_scan: FloatArray) -> None:
@@ -562,7 +565,11 @@ def begin(plan: RecordingPlan, target: AxesAndClasses, metadata: Metadata) -> No
     if plan.again and existing is not None:
         documents[layout.METADATA] = described.to_json()
     documents[layout.TIMES] = agree_lines(
-        writer, layout.TIMES, plan.times - plan.times[0], is_whole=plan.again
+        writer,
+        layout.TIMES,
+        plan.times - plan.times[0],
+        is_whole=plan.again,
+        may_change=lambda: plan.is_same,
     )
     if plan.voxels is not None:
         documents[layout.params_file(layout.grid_folder(plan.voxels))] = to_json(
@@ -586,7 +593,7 @@ def write_poses(plan: RecordingPlan, target: AxesAndClasses) -> None:
     """
     assert plan.poses is not None
     poses = mirror_poses(plan.poses) if target.mirrored else plan.poses
-    if plan.again and plan.pose_source == KISS_ICP:
+    if plan.is_same or (plan.again and plan.pose_source == KISS_ICP):
         _write(plan, {layout.POSES: layout.encode_poses(poses)})
     else:
         _write(

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from carlasc.converting.assembling import LayoutOptions
+from carlasc.converting.clips import convert_clips
 from carlasc.converting.plans import (
     KISS_ICP,
     RecordingPlan,
@@ -40,14 +41,13 @@ from carlasc.running.processes import one_pool
 from carlasc.running.spreading import Part, Run, StepCounter
 from carlasc.storage.files import AnyPath
 from carlasc.storage.inputs import (
-    UNKNOWN,
     MadeFrom,
     changed_names,
     combined,
     folder_states,
     made_again,
 )
-from carlasc.storage.layout import Metadata
+from carlasc.storage.layout import Metadata, place_of
 from carlasc.storage.opening import as_sink
 from carlasc.storage.protocol import Sequence, Sink, Source
 from carlasc.storage.transport.remote_tree import check_shared
@@ -56,6 +56,7 @@ from carlasc.storage.transport.trees import LocalTarget
 Grids = GridOptions | Literal["voxels"] | None
 _RECORD = "conversion"
 _GAP = "gap"  # in the record: a frame that failed, and others were finished without it
+_UNKNOWN = "there was no record of what frames were made from, so all were compared"
 _LOOKED_AT = (
     3  # number of sequences, and of scans of each, in which points outside of the grid are counted
 )
@@ -99,6 +100,7 @@ def convert(
     poses: PoseOptions = PoseOptions(),  # noqa: B008 (frozen)
     grids: Grids = GridOptions(),  # noqa: B008 (frozen)
     options: Mapping[str, Any] | None = None,
+    scratch: str = "20GB",
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> ConvertResult:
     """Write another data set as sequences of the CarlaSC layout: the same files, axes and classes;
@@ -127,9 +129,12 @@ def convert(
             own voxels, with count 0 where they are unknown; None writes no grids.
         options: options of the converter, by name; text is parsed as the type of the option (see
             `option_declarations`).
+        scratch: with a list of clips: largest size of what is fetched and not deleted yet.
         run: how the work is spread. A part converts whole recordings, because poses and motion are
             estimated along each of them. Grids then keep their height, because the ground of the
-            other recordings is not known.
+            other recordings is not known. `sequences_from` lists clips, each with recordings of its
+            own: URLs, or paths below `source`. Each is fetched, converted, and deleted; one that
+            fails is reported, and tried again by the next call.
 
     Returns:
         What was written, what was skipped, and what failed.
@@ -141,13 +146,26 @@ def convert(
         ConflictError: `out` lies inside `source`, or holds other data.
         StorageError: the output cannot be written. The files written so far are complete.
     """
-    check_types(convert, locals())
+    arguments = dict(locals())
+    check_types(convert, arguments)
     start = time.perf_counter()
+    if run.is_share and isinstance(grids, GridOptions) and grids.follow_ground:
+        raise ArgumentError(
+            "follow_ground",
+            expected="False, or `grids=None`, because a part does not know the ground of all "
+            "recordings",
+            found="True",
+        )
+    if run.sequences_from is not None and not isinstance(out, Sink):
+        places = {"source", "out", "run", "scratch"}
+        given = {key: arguments[key] for key in sorted(arguments.keys() - places)}
+        results = convert_clips(convert, source, out, given, scratch, run)
+        return _joined(results, time.perf_counter() - start)
     root = Path(source)
     converter = open_converter(name, root, options)
     target, sink = layout.of(converter), as_sink(out, part=run.part)
     check_shared(sink.location, run)
-    _check(root, sink, split, grids, run.part)
+    _check(root, sink, split, grids)
     compare = layout.compare_inputs
     found = find_recordings(converter)
     recordings = _deal(choose_recordings(found, root, sequences, split), run.part)
@@ -229,6 +247,18 @@ def convert(
     )
 
 
+def _joined(results: Series[ConvertResult | Failure], elapsed_s: float) -> ConvertResult:
+    """Return the result of several clips, some of which failed as a whole."""
+    whole = [one for one in results if isinstance(one, ConvertResult)]
+    values: dict[str, Any] = {"elapsed_s": elapsed_s}
+    for name in ("made", "skipped"):
+        values[name] = sum(getattr(one, name) for one in whole)
+    for name in ("sequences", "failures", "grids", "notes", "findings"):
+        values[name] = tuple(value for one in whole for value in getattr(one, name))
+    values["failures"] += tuple(one for one in results if isinstance(one, Failure))
+    return ConvertResult(**values)
+
+
 @dataclass
 class _ConvertedFrom:
     """The states of the files that a recording is converted from, and their record.
@@ -258,21 +288,18 @@ class _ConvertedFrom:
             return
         exists = len(plan.missing) < len(plan.recording.frames)
         is_other = before.own != states or _GAP in before.frames.values()
-        if exists and (compare == "content" or (before.whole and is_other)):
-            plan.make_again()
-        elif exists and not before.whole:
-            self.states = None
-            self.notes.append(f"{plan.writer.location}: {UNKNOWN}")
+        if exists and (compare == "content" or is_other):
+            plan.make_again(is_same=bool(before.own.items() & states.items()))
         else:
             self._write(())
 
     def finish(self, conversion: Conversion) -> None:
         """Write the record, after the frames were written."""
         if self.plan.again:
-            conversion.remove_others(map(int, self._before.frames))
-            if conversion.changed:
-                why = changed_names(self._before.own, self.states or {})
-                where = self.plan.writer.location
+            before, where = self._before, self.plan.writer.location
+            conversion.remove_others(map(int, before.frames))
+            if conversion.changed or not before.own:
+                why = changed_names(before.own, self.states or {}) if before.own else _UNKNOWN
                 self.notes.append(f"{where}: {made_again(conversion.changed, why)}")
         has_gaps = conversion.allow_gaps or self.plan.pose_source == KISS_ICP
         self._write(conversion.failed if has_gaps else ())
@@ -317,7 +344,7 @@ class _ConvertedScans(Source):
         self._chosen = {sequence_path(one.plan.recording): one for one in conversions}
 
     def sequences(self) -> dict[str, Sequence]:
-        found = self._source.sequences()
+        found = self._source.sequences_in([*map(place_of, self._chosen)])
         chosen = {path: found[path] for path in found if path in self._chosen}
         for path, sequence in chosen.items():
             conversion = self._chosen[path]
@@ -402,7 +429,7 @@ def _deal(recordings: Series[Recording], part: Part) -> list[Recording]:
     return [recordings[index] for index in np.flatnonzero(shares == part.number - 1).tolist()]
 
 
-def _check(source: Path, sink: Sink, split: str, grids: Grids, part: Part) -> None:
+def _check(source: Path, sink: Sink, split: str, grids: Grids) -> None:
     """Check the arguments, before recordings are searched for.
 
     Raises:
@@ -431,13 +458,6 @@ def _check(source: Path, sink: Sink, split: str, grids: Grids, part: Part) -> No
                 expected=f"none with {sink.location}, which cannot be read while it is written",
                 found="scans",
                 advice="convert to a folder or a .zarr store",
-            )
-        if part.count > 1 and grids.follow_ground:
-            raise ArgumentError(
-                "follow_ground",
-                expected="False, or `grids=None`, because a part does not know the ground of all "
-                "recordings",
-                found="True",
             )
     if not source.exists():
         raise MissingDataError(

@@ -661,6 +661,8 @@ def _write_cameras(plan: RecordingPlan, target: AxesAndClasses, images: Images) 
     """Write the cameras of a recording, and their images if they are copied; return notes."""
     cameras = plan.recording.cameras()
     if not cameras:
+        if plan.again:
+            plan.writer.remove_document(layout.CAMERAS)
         return []
     target_T_scan = np.diag([1.0, -1.0 if target.mirrored else 1.0, 1.0, 1.0])
     scan_T_vehicle = target_T_scan @ invert(plan.rig.vehicle_T_scan)

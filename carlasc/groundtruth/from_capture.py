@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from collections.abc import Sequence as Series
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -212,8 +213,10 @@ class CaptureSequence(SequenceInput):
         return {"observe": "capture", "frames": frames, "sensors": len(self.capture.sensors)}
 
 
-def capture_sequences(source: AnyPath | Source | Capture, plan: GridPlan) -> list[SequenceInput]:
-    """Find the captures in or below a folder.
+def capture_sequences(
+    source: AnyPath | Source | Capture, plan: GridPlan, places: Series[str] = ("",)
+) -> list[SequenceInput]:
+    """Find the captures in or below some places of a folder.
 
     Raises:
         ArgumentError: the source is not a path.
@@ -223,7 +226,8 @@ def capture_sequences(source: AnyPath | Source | Capture, plan: GridPlan) -> lis
         return [CaptureSequence(source, "", plan)]
     if isinstance(source, Source):
         raise ArgumentError("source", expected="a folder with a capture", found=repr(source))
-    return [CaptureSequence(capture, path, plan) for path, capture in find_captures(source).items()]
+    found = find_captures(source, places).items()
+    return [CaptureSequence(capture, path, plan) for path, capture in found]
 
 
 def _present(array: AnyArray | None) -> AnyArray:

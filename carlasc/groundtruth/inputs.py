@@ -30,6 +30,7 @@ from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.camera_files import cameras_of, scan_T_camera
 from carlasc.storage.inputs import (
+    ACCEPTED,
     FrameFiles,
     MadeFrom,
     SequenceFiles,
@@ -40,6 +41,7 @@ from carlasc.storage.inputs import (
 )
 from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import Sequence, SequenceWriter
+from carlasc.storage.resuming import agree_lines
 
 if TYPE_CHECKING:
     from carlasc.groundtruth.seen import Views
@@ -333,7 +335,7 @@ class StoredSequence(SequenceInput):
 
     def __init__(self, sequence: Sequence, plan: GridPlan) -> None:
         self.sequence, self.plan = sequence, plan
-        self.path = parent_path(sequence)
+        self.path = layout.place_of(sequence.path)
         self.location, self.metadata = sequence.location, sequence.metadata
 
     def files(self) -> FrameFiles | None:
@@ -413,16 +415,16 @@ class InputCheck:
             return
         contents = content_digests(files, inputs.depended(), self.writer, self.compare, run)
         inputs.take_contents(contents)
-        self._own = {
-            str(frame): combined(content, inputs.about(frame))
-            for frame, content in sorted(contents.items())
-        }
+        self._own = self._own_of(contents)
         self._whole = combined(sorted(self._own.items()), inputs.shared())
         self.changed = self.must_record = bool(record.frames) and self._whole != record.whole
         recorded = {frame: record.frames.get(str(frame)) for frame in existing}
         if not self.changed and all(recorded.values()):
             return
         inputs.prepare(self.writer, run, StepCounter(None))
+        if all(self._own.get(frame, own) == own for frame, own in record.own.items()):
+            accepted = [frame for frame, made in recorded.items() if made == ACCEPTED]
+            recorded |= {frame: self._made_from(frame) for frame in accepted}
         self.gone = {int(frame) for frame in record.frames} - set(inputs.available())
         self.stale = {
             frame for frame, made in recorded.items() if made not in (None, self._made_from(frame))
@@ -436,6 +438,22 @@ class InputCheck:
         if unknown := [frame for frame in sorted(existing) if recorded[frame] is None]:
             self._accept(unknown, agrees)
             self.must_record = True
+
+    def _own_of(self, contents: Mapping[int, str]) -> dict[str, str]:
+        return {
+            str(frame): combined(content, self.inputs.about(frame))
+            for frame, content in sorted(contents.items())
+        }
+
+    def is_of_input(self) -> bool:
+        """Whether the grid was made from this input, of which some frames changed since: most
+        others are as they were.
+        """
+        before, files = MadeFrom.read(self.writer, self._name).own, self.inputs.files()
+        if files is None or self.compare == "never":
+            return False
+        now = self._own_of(content_digests(files, self.inputs.depended()))
+        return 2 * len(now.items() & before.items()) >= max(len(now), 1)
 
     def _made_from(self, frame: int) -> str:
         if frame not in self._made:
@@ -465,20 +483,40 @@ class InputCheck:
         if not self._whole:
             return
         record, writer = self._record, self.writer
+        is_copy = os.path.realpath(writer.location) != os.path.realpath(self.inputs.location)
         if self.gone:
-            is_copy = os.path.realpath(writer.location) != os.path.realpath(self.inputs.location)
             written = [f"{self.grid}/{part}" for part in layout.GRID_FIELDS]
             writer.remove_frames([*(layout.SCAN_FIELDS if is_copy else ()), *written], self.gone)
+        if self.changed and is_copy:
+            self._remove_others()
         for frame in self.gone:
             del record.frames[str(frame)]
         record.frames |= {
             str(frame): "" if frame in self.stale else self._made_from(frame)
             for frame in sorted(numbers)
-            if frame in missing or frame in self.stale or str(frame) not in record.frames
+            if frame in missing
+            or frame in self.stale
+            or record.frames.get(str(frame), ACCEPTED) == ACCEPTED
         }
         # only a run that ends says that all frames and the report are of these inputs
         record.own, record.whole = self._own, "" if self.changed or self.stale else self._whole
         record.write(self.writer, self._name)
+
+    def _remove_others(self) -> None:
+        """Remove from a copy the lines, text files and fields that the input has no longer."""
+        inputs, writer = self.inputs, self.writer
+        of_frames = {layout.POSES: inputs.poses(), layout.TIMES: inputs.times()}
+        for name, lines in of_frames.items():
+            if self.gone and (left := agree_lines(writer, name, lines, is_whole=True)):
+                writer.write_document(name, left)
+        for name, content in ((layout.TIMES, inputs.times()), (layout.CAMERAS, inputs.cameras())):
+            if content is None:
+                writer.remove_document(name)
+        for frame in inputs.frames:
+            if frame.number in self.stale:
+                others = {*layout.SCAN_FIELDS} - {*frame.fields()}
+                if there := [name for name in others if writer.has(name, frame.number)]:
+                    writer.remove_frames(there, [frame.number])
 
     def finish(self, made: Collection[int]) -> None:
         """Complete the record, after the frames and the report were written.
@@ -524,12 +562,6 @@ def stored_views(sequence: Sequence, frame: int) -> Views:
     return [
         (camera, scan_T_camera(sequence, camera, frame)) for camera in cameras_of(sequence).values()
     ]
-
-
-def parent_path(sequence: Sequence) -> str:
-    """Return the path above `<coordinates>`, where a run writes the sequence again."""
-    head, _, last = sequence.path.rpartition("/")
-    return head if last == sequence.coordinates else sequence.path
 
 
 def without_caches(sequence: Sequence) -> Sequence:

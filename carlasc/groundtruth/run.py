@@ -65,6 +65,7 @@ from carlasc.storage.resuming import (
     check_name,
     check_scan,
 )
+from carlasc.storage.shares import Share, source_in
 from carlasc.storage.transport.remote_tree import check_shared
 from carlasc.storage.transport.trees import is_url
 
@@ -165,16 +166,23 @@ def regrid(
     sink = as_sink(_folder_of(source) if out is None else out, part=run.part)
     for place in (sink.location, str(source)):
         check_shared(place, run)
-    plan = GridPlan(
-        spec, grid, _choose(source) if observe is None else observe, voting, FrameRange.of(frames)
-    )
-    jobs = [
-        _prepare(inputs, sink, plan, compare_inputs, overwrite=overwrite)
-        for inputs in _sequences(source, plan)
-    ]
+    share = None
+    if run.is_share and not isinstance(source, Capture):
+        share = Share(as_source(source), run)
+    places, others = ([""], []) if share is None else (share.own, share.others)
+    if observe is None:
+        observe = _choose(source, share)
+    plan = GridPlan(spec, grid, observe, voting, FrameRange.of(frames))
+    found = list[SequenceInput]()
+    try:
+        found += _sequences(source, plan, places)
+    except MissingDataError:
+        if not others:
+            raise
+    jobs = [_prepare(one, sink, plan, compare_inputs, overwrite=overwrite) for one in found]
 
     with ExitStack() as open_things:
-        pool = open_things.enter_context(one_pool(run))
+        pool = open_things.enter_context(one_pool(run if share is None else share.run))
         for job in jobs:
             _begin(job)
             job.announce()
@@ -185,7 +193,9 @@ def regrid(
     if sink is not out and (work.has_written or not sink.is_finished):
         if run.part.count == 1:
             sink.finish(incomplete=True)  # missing frames could not be made, and are reported
-        elif not any(job.missing() for job in jobs):
+        elif not any(job.missing() for job in jobs) and all(
+            _is_complete(source, plan, sink, place) for place in others
+        ):
             sink.finish()
 
     grids = tuple(sink.place(f"{job.path}/{grid}") for job in jobs)
@@ -196,8 +206,21 @@ def regrid(
     return RegridResult(grids, spec, made, work.skipped, tuple(failures), took, notes, uses)
 
 
-def _choose(source: AnyPath | Source | Capture) -> Observe:
-    """Return the default of `observe`: a capture if there is one, otherwise scans.
+def _is_complete(
+    source: AnyPath | Source | Capture, plan: GridPlan, sink: Sink, place: str
+) -> bool:
+    """Whether another part has made the sequences of a folder."""
+    try:
+        found = _sequences(source, plan, [place])
+    except MissingDataError:
+        return True
+    paths = [f"{one.path}/{plan.spec.coordinates}".lstrip("/") for one in found]
+    return all(sink.sequence(path).is_complete() for path in paths)
+
+
+def _choose(source: AnyPath | Source | Capture, share: Share | None) -> Observe:
+    """Return the default of `observe`: a capture if there is one, otherwise scans. Parts look at
+    their own sequences, and at the first one.
 
     Raises:
         MissingDataError: there is neither.
@@ -206,12 +229,12 @@ def _choose(source: AnyPath | Source | Capture) -> Observe:
         return FromCapture()
     if not isinstance(source, Source):
         try:
-            find_captures(source)
+            find_captures(source, ("",) if share is None else [*share.own, share.first])
         except MissingDataError:
             pass
         else:
             return FromCapture()
-    opened = as_source(source)
+    opened = as_source(source) if share is None else share
     try:
         opened.sequences()
     except MissingDataError as error:
@@ -225,22 +248,27 @@ def _choose(source: AnyPath | Source | Capture) -> Observe:
     return FromScans()
 
 
-def _sequences(source: AnyPath | Source | Capture, plan: GridPlan) -> list[SequenceInput]:
-    """Return the sequences of a source.
+def _sequences(
+    source: AnyPath | Source | Capture, plan: GridPlan, places: Series[str]
+) -> list[SequenceInput]:
+    """Return the sequences of some places of a source: see `Source.places`.
 
     Raises:
         ArgumentError: the source does not fit `observe` or the plan.
         MissingDataError: there is no sequence.
     """
     if isinstance(plan.observe, FromCapture):
-        return capture_sequences(source, plan)
+        return capture_sequences(source, plan, places)
     if isinstance(source, Capture):
         raise ArgumentError(
             "observe", expected="FromCapture() with a capture", found=repr(plan.observe)
         )
+    opened = as_source(source)
+    if [*places] != [""]:
+        opened = source_in(opened, places)
     if isinstance(plan.observe, FromScans):
-        return scan_sequences(source, plan, plan.observe)
-    return resampled_sequences(source, plan, plan.observe)
+        return scan_sequences(opened, plan, plan.observe)
+    return resampled_sequences(opened, plan, plan.observe)
 
 
 def _folder_of(source: AnyPath | Source | Capture) -> str | Path:
@@ -286,15 +314,19 @@ def _prepare(
     params = parse_json(to_json(settings), plan.grid)  # as a later run reads it
     numbers = [frame.number for frame in inputs.frames]
     exists = check_grid(writer, plan.grid, params, numbers, overwrite=overwrite)
+    check = InputCheck(inputs, writer, plan.grid, compare)
     documents = {
         layout.METADATA: agree_metadata(writer, inputs.metadata),
-        layout.POSES: agree_lines(writer, layout.POSES, inputs.poses()),
-        layout.TIMES: agree_lines(writer, layout.TIMES, inputs.times()),
+        layout.POSES: agree_lines(
+            writer, layout.POSES, inputs.poses(), may_change=check.is_of_input
+        ),
+        layout.TIMES: agree_lines(
+            writer, layout.TIMES, inputs.times(), may_change=check.is_of_input
+        ),
         layout.CAMERAS: None if cameras == writer.read_document(layout.CAMERAS) else cameras,
         layout.params_file(plan.grid): to_json(params),
     }
     needed = {name: data for name, data in documents.items() if data is not None}
-    check = InputCheck(inputs, writer, plan.grid, compare)
     replaces = exists and overwrite
     return SequenceJob(path, inputs, plan, writer, needed, params, replaces, check)
 
@@ -580,6 +612,23 @@ class SequenceJob:
             )
         )
 
+    def _documents(self) -> dict[str, bytes]:
+        """Return the text files that a report is made from."""
+        names = (layout.POSES, layout.TIMES, layout.METADATA, layout.params_file(self.plan.grid))
+        found = {name: self.writer.read_document(name) for name in names}
+        return {name: data for name, data in found.items() if data is not None}
+
+    def is_reported(self) -> bool:
+        """Whether the report covers all frames, and its text files are those of now."""
+        report, now = self.report(), self._documents()
+        return (
+            report is not None
+            and not self.check.changed
+            and set(report.frames) >= self.numbers
+            and report.documents.keys() == now.keys()
+            and all(report.documents[name].matches(data) for name, data in now.items())
+        )
+
     def report(self) -> Report | None:
         """Return the report of an earlier run with the same settings; None without one."""
         name = layout.report_file(self.plan.grid)
@@ -617,11 +666,7 @@ class SequenceJob:
     def write_report(self, results: Series[FrameResult]) -> None:
         """Write the report, if anything was made or measured."""
         facts = [done.facts for done in results if done.facts is not None]
-        grid, writer = self.plan.grid, self.writer
-        names = (layout.POSES, layout.TIMES, layout.METADATA, layout.params_file(grid))
-        documents = {
-            name: data for name in names if (data := writer.read_document(name)) is not None
-        }
+        grid, writer, documents = self.plan.grid, self.writer, self._documents()
         if facts:
             inputs = self.inputs
             classes, actors, poses = (
@@ -716,13 +761,11 @@ class Work:
             if done.task.frame is not None and done.error is not None:
                 frame = done.task.frame.source_frame
                 self.failures.append(FrameFailure(job.inputs.location, frame, done.error))
-        report, tried = job.report(), {done.task.number for done in made}
-        is_reported = report is not None and set(report.frames) >= job.numbers
-        is_reported &= not made and not job.check.changed
-        if not (is_reported or (self.spread.part.count > 1 and job.missing())):
-            self._report(job, made, tried)
         if job.check.must_record and not made:
             job.check.begin(job.numbers, ())
+        is_reported = not made and job.is_reported()
+        if not (is_reported or (self.spread.part.count > 1 and job.missing())):
+            self._report(job, made, {done.task.number for done in made})
         if made or job.check.must_record:
             job.check.finish({done.task.number for done in made if done.error is None})
 

@@ -27,6 +27,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import CarlascError
 from carlasc.inspection.pose_quality import PoseQuality, angles_of, measure_poses
 from carlasc.motion.joint_alignment import blocks, spread_of
+from carlasc.motion.odometry import measure_drift
 from carlasc.motion.solving import principal_axes
 from carlasc.storage.protocol import Sequence
 
@@ -331,6 +332,7 @@ class LongOverlap:
 
     share: float
     open_way: FloatArray | None = None
+    drift: tuple[float, bool] = (0.0, True)
 
     def is_wrong(self, near: float) -> bool:
         """Return whether a motion is missing: `near` is the share of neighbouring scans."""
@@ -346,15 +348,20 @@ class LongOverlap:
                 "the frame of the first scan: no surface determines the position there, or the "
                 "poses are wrong"
             )
+        if self.share >= 0 and not self.drift[1]:
+            return "no surface that the scans see determines the height"
         return "" if self.share >= 0 else "scans have too few upright things"
 
 
-def measure_overlap(structure: Callable[[int], FloatArray], poses: Poses) -> LongOverlap:
+def measure_overlap(
+    structure: Callable[[int], FloatArray], points: Callable[[int], AnyFloatArray], poses: Poses
+) -> LongOverlap:
     """Measure the overlap of scans that are near each other under their poses but far in time, and
     whether it determines their positions.
 
     Args:
         structure: returns the (M, 3) structure of the i-th scan.
+        points: returns all (N, 3) points of the i-th scan.
         poses: (F, 4, 4) first_T_sensor of each scan, in order of time; rigid.
     """
     pairs, facing = [], np.zeros((2, 2))
@@ -389,7 +396,8 @@ def measure_overlap(structure: Callable[[int], FloatArray], poses: Poses) -> Lon
     own, *others = np.mean(shares, axis=0).tolist()
     faced = ways[0] > _FACING * ways.sum()
     needed = 1.0 if faced else _MOVED if np.median(along) > VOXEL_M else _STOOD
-    return LongOverlap(own, way if own < needed * max(others) else None)
+    open_way = way if own < needed * max(others) else None
+    return LongOverlap(own, open_way, measure_drift(points, poses))
 
 
 def choose_pairs(poses: Poses, max_pairs: int) -> list[tuple[int, int]]:

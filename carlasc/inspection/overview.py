@@ -4,10 +4,11 @@ files only.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,14 +19,18 @@ from carlasc.core.arrays import IntArray
 from carlasc.core.notebook import data_frame
 from carlasc.errors import CarlascError, MissingDataError, check_types, without_credentials
 from carlasc.inspection.staleness import changed_inputs
+from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath
 from carlasc.storage.folder import FolderSequence
-from carlasc.storage.layout import Metadata
+from carlasc.storage.layout import Metadata, identity_of
 from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.shares import read_list, source_in
 
 if TYPE_CHECKING:
     import pandas
+
+    from carlasc.metrics.results import Interval
 
 _SIZED = 3  # the size of a field is estimated from this number of files
 
@@ -130,6 +135,7 @@ class Overview:
         sequences: in sorted order.
         captures: in sorted order.
         bytes: size of the file, if the source is one file; None for folders.
+        places: number of folders of sequences by split; empty if all were looked at.
     """
 
     location: str
@@ -138,11 +144,25 @@ class Overview:
     sequences: tuple[SequenceOverview, ...]
     captures: tuple[CaptureOverview, ...]
     bytes: int | None
+    places: Mapping[str, int] = field(default_factory=dict)
+
+    def total(self, name: str) -> Interval:
+        """Return the sum of "frames" or "bytes" over all sequences, with its interval if only some
+        were looked at.
+        """
+        from carlasc.metrics.results import interval_of  # compiles loops, for scores
+
+        values = np.array([getattr(one, name) or 0 for one in self.sequences], np.float64)
+        number, degrees = sum(self.places.values()) or len(values), len(values) - 1
+        missed = 1 - len(values) / number
+        variance = missed * number**2 * values.var(ddof=1) / len(values) if degrees else math.nan
+        return interval_of(number * values.mean(), (variance, degrees or 1))
 
     @property
     def splits(self) -> dict[str, int]:
         """Number of sequences by split; "none" counts sequences without a split in their path."""
-        return dict(Counter(sequence.split or "none" for sequence in self.sequences))
+        counted = Counter(sequence.split or "none" for sequence in self.sequences)
+        return dict(self.places or counted)
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return a row per sequence, with the attributes of `SequenceOverview`; fields, documents
@@ -162,27 +182,39 @@ class Overview:
         return asdict(self) | {"splits": self.splits}
 
 
-def info(source: AnyPath | Source) -> Overview:
+def info(
+    source: AnyPath | Source, *, sample: int | None = None, sequences_from: AnyPath | None = None
+) -> Overview:
     """List the contents of a data set. No frame is read.
 
     Args:
         source: a path or URL that `carlasc.open` knows, a raw capture, or a Source.
+        sample: number of sequences to look at, evenly spaced, if there are more. None: all.
+        sequences_from: file with the folders of the sequences, one per line, which is written if it
+            does not exist. None: the source is listed.
 
     Raises:
         MissingDataError: the source holds neither a sequence nor a capture.
     """
     check_types(info, locals())
+    places, chosen = list[str](), [""]
+    if sample is not None or sequences_from is not None:
+        places = read_list(Run(sequences_from=sequences_from), as_source(source).places)
+        step = -(-len(places) // max(sample or len(places), 1))
+        chosen = places[::step]
     captures: dict[str, Capture] = {}
     if not isinstance(source, Source):
         with suppress(MissingDataError):
-            captures = find_captures(source)
+            captures = find_captures(source, chosen)
     recorded = tuple(_describe_capture(path, capture) for path, capture in captures.items())
     sequences: dict[str, Sequence] = {}
     try:
         opened = as_source(source)
         # raw/ has a bev/ folder, like a sequence, but is a capture
         sequences = {
-            path: s for path, s in opened.sequences().items() if s.fields() or path not in captures
+            path: s
+            for path, s in source_in(opened, chosen).sequences().items()
+            if s.fields() or path not in captures
         }
     except MissingDataError:
         if not captures:
@@ -197,6 +229,9 @@ def info(source: AnyPath | Source) -> Overview:
         tuple(_describe(sequence) for sequence in sequences.values()),
         recorded,
         location.stat().st_size if location.is_file() else None,
+        Counter(identity_of(f"{place}/cartesian")[0] or "none" for place in places)
+        if len(chosen) < len(places)
+        else {},
     )
 
 

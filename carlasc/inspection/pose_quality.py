@@ -112,13 +112,9 @@ def describe_mounting(mounting: Mounting) -> tuple[str, str] | None:
     """
     wrong, values, errors = mounting.wrong, mounting.values, mounting.errors
     described, advice = [], "write corrected poses with `carlasc refine`"
+    said = list(mounting.describe().items())
     if wrong[:3].any():
-        place = ", ".join(
-            f"{axis} = {values[i]:.2f} ± {errors[i]:.2f} m"
-            if mounting.determined[i]
-            else f"{axis} undetermined"
-            for i, axis in enumerate("xyz")
-        )
+        place = ", ".join(f"{axis} = {value}" for axis, value in said[:3])
         described.append(
             f"poses of another point of the vehicle: in their frame, the sensor is at about {place}"
         )
@@ -127,11 +123,7 @@ def describe_mounting(mounting: Mounting) -> tuple[str, str] | None:
             f"of the poses (from the calibration), or {advice}"
         )
     if wrong[3:6].any():
-        turned = " and ".join(
-            f"{name} {np.rad2deg(values[i]):.1f} ± {np.rad2deg(errors[i]):.1f} degrees"
-            for i, name in enumerate(("roll", "pitch", "yaw"), 3)
-            if wrong[i]
-        )
+        turned = " and ".join(f"{said[i][0]} {said[i][1]}" for i in (3, 4, 5) if wrong[i])
         described.append(f"poses in whose frame the sensor is turned by {turned}")
         advice = f"check the rotation of the calibration, which no command changes; {advice}"
     if wrong[6]:

@@ -10,11 +10,12 @@ import numpy as np
 
 from carlasc.captures.raw import RAW, Capture, CaptureFiles
 from carlasc.core.frames import FrameRange
-from carlasc.errors import CarlascError
+from carlasc.errors import ArgumentError, CarlascError, count
 from carlasc.inspection.findings import Finding, Severity
 from carlasc.running.spreading import Run
-from carlasc.storage.folder import FolderSequence
+from carlasc.storage.folder import FolderSequence, FolderWriter
 from carlasc.storage.inputs import (
+    ACCEPTED,
     FrameFiles,
     MadeFrom,
     SequenceFiles,
@@ -23,6 +24,7 @@ from carlasc.storage.inputs import (
     describe_changes,
 )
 from carlasc.storage.protocol import Sequence, SequenceWriter
+from carlasc.storage.resuming import RECORD
 
 _SEED = 0
 _ADVICE = "make the grid again with the command that made it: it makes what changed again"
@@ -93,33 +95,72 @@ def check_sample(sequence: Sequence, count: int, run: Run) -> Iterator[Finding]:
         yield Finding(kind, "inputs", where, expected, found, advice)
 
 
+def record_inputs(sequence: Sequence) -> Iterator[Finding]:
+    """Accept the frames of grids without a record of what they were made from, as made of the
+    inputs as they are now; and yield a note for each grid.
+
+    Raises:
+        ArgumentError: such a grid is not in a folder.
+    """
+    for grid in sequence.grids:
+        frames, record = sequence.frames(f"{grid}/labels").tolist(), _record(sequence, grid)
+        unknown = [frame for frame in frames if str(frame) not in record.frames]
+        now = _own_now(sequence, grid, record)
+        if not unknown or not now or changed_inputs(sequence, grid):
+            continue
+        if not isinstance(sequence, FolderSequence):
+            found = sequence.location
+            raise ArgumentError("record", expected="a folder, which keeps records", found=found)
+        accepted = {str(frame): ACCEPTED for frame in unknown}
+        accepted_record = MadeFrom(record.whole, record.own or now, record.frames | accepted)
+        accepted_record.write(FolderWriter(sequence.folder), f"made-{grid}")
+        found = f"none of {count(len(unknown), 'frame')}: they count as made of the inputs of now"
+        where, expected = f"{sequence.location}/{grid}", "a record of what frames were made from"
+        yield Finding("note", "inputs", where, expected, found)
+
+
 def changed_inputs(sequence: Sequence, grid: str) -> str:
     """Return what changed of the inputs of a grid since it was made, such as "scan 12 changed";
     empty if nothing did, or if it is not known.
     """
-    writer, made = _Records(sequence), sequence.params(grid).get("carlasc")
-    record = MadeFrom.read(writer, f"made-{grid}")
-    if not record.own or not isinstance(made, dict):
+    record = _record(sequence, grid)
+    if not record.own or not (now := _own_now(sequence, grid, record)):
         return ""
+    # an output may have a part of the scans only, but none that its input has not
+    is_capture = sequence.params(grid)[RECORD]["observe"] == "capture"
+    required = record.own if is_capture else record.frames
+    before = {frame: own for frame, own in record.own.items() if frame in now or frame in required}
+    return describe_changes(before, now)
+
+
+def _record(sequence: Sequence, grid: str) -> MadeFrom:
+    return MadeFrom.read(_Records(sequence), f"made-{grid}")
+
+
+def _own_now(sequence: Sequence, grid: str, record: MadeFrom) -> dict[str, str]:
+    """Return the digests of the frames that a grid is made from, those of its record if it has one;
+    none if they are not known.
+    """
+    made = sequence.params(grid).get(RECORD)
+    if not isinstance(made, dict):
+        return {}
     try:
         files, known = _files(sequence, made)
         if files is None:
-            return ""
+            return {}
         window = [int(end) for end in str(made.get("window", "0:0")).split(":")]
         near = {int(n) + i for n in record.frames for i in range(window[0], window[1] + 1)}
-        wanted = [frame for frame in known if str(frame) in record.own or frame in near]
-        contents = content_digests(files, wanted, writer)
+        wanted = [
+            frame for frame in known if not record.own or str(frame) in record.own or frame in near
+        ]
+        contents = content_digests(files, wanted, _Records(sequence))
         estimated = made.get("poses") == "kiss-icp"
-        now = {
+        return {
             str(frame): combined(content, _about(sequence, made["observe"], frame, estimated))
             for frame, content in contents.items()
         }
     except (CarlascError, OSError, KeyError, ValueError):  # which other checks report
-        return ""
-    # an output may have a part of the scans only, but none that its input has not
-    required = record.own if made["observe"] == "capture" else record.frames
-    before = {frame: own for frame, own in record.own.items() if frame in now or frame in required}
-    return describe_changes(before, now)
+        return {}
 
 
 def _files(sequence: Sequence, made: Mapping[str, object]) -> tuple[FrameFiles | None, list[int]]:

@@ -46,8 +46,9 @@ from carlasc.inspection.soundness import (
     record_accepted,
     untested,
 )
-from carlasc.inspection.staleness import check_inputs, check_sample
+from carlasc.inspection.staleness import check_inputs, check_sample, record_inputs
 from carlasc.motion.ground import ground_of
+from carlasc.motion.odometry import DRIFT_M
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
@@ -143,6 +144,7 @@ def validate(
     every: int | None = None,
     accept: Collection[str] = (),
     sample: int = 0,
+    record: bool = False,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> ValidationResult:
     """Check a data set: files against each other, values, poses, times, and scans against poses and
@@ -160,6 +162,8 @@ def validate(
             sequence then says so.
         sample: number of frames of each grid that are made again from the scans beside it and
             compared.
+        record: accept grids without a record of what they were made from: write the record of the
+            inputs as they are now.
         run: how the work is spread over the sequences, with a callback for progress.
 
     Returns:
@@ -167,7 +171,7 @@ def validate(
 
     Raises:
         ArgumentError: `every` is less than 1, no check has the name of an accepted one, or the data
-            are not in a folder, so that they cannot say what was accepted.
+            are not in a folder, so that they cannot say what was accepted or recorded.
         MissingDataError: there is no data set.
     """
     check_types(validate, locals())
@@ -183,10 +187,9 @@ def validate(
     else:
         examined = run_all(_examine, plans, run, lost=_fail)
     for plan, (in_sequence, report) in zip(plans, examined, strict=True):
-        named = [replace(finding, sequence=plan.sequence.path) for finding in in_sequence]
-        if sample > 0:
-            path, more = plan.sequence.path, check_sample(plan.sequence, sample, run)
-            named += [replace(finding, sequence=path) for finding in more]
+        more = [*in_sequence, *(record_inputs(plan.sequence) if record else ())]
+        more += check_sample(plan.sequence, sample, run) if sample > 0 else ()
+        named = [replace(finding, sequence=plan.sequence.path) for finding in more]
         findings += sorted(named, key=lambda finding: SEVERITIES.index(finding.severity))
         reports.append(report)
         if not run.is_alone:
@@ -369,8 +372,9 @@ def _diagnose_poses(sequence: Sequence) -> tuple[PoseDiagnosis, LongOverlap] | t
         seconds = None
     if seconds is not None and not (np.diff(seconds) > 0).all():
         seconds = None  # which is reported elsewhere
-    found = diagnose_poses(structure, poses, points=reading(feed.static_points), seconds=seconds)
-    return found, measure_overlap(structure, poses)
+    points = reading(feed.static_points)
+    found = diagnose_poses(structure, poses, points=points, seconds=seconds)
+    return found, measure_overlap(structure, points, poses)
 
 
 def _judge_grid(
@@ -448,6 +452,12 @@ def _judge_poses(
         advice = "check that the poses belong to this sequence and to these frames"
     elif described is not None:
         found, advice = described
+    elif overlap.drift[0] > DRIFT_M:
+        found = f"scans that fit {overlap.drift[0]:.2f} m from their poses within ten scans"
+        advice = (
+            "write refined poses with `carlasc refine`, or estimate them with `carlasc convert "
+            "--poses kiss-icp`"
+        )
     elif quality is not None and quality.is_poor:
         check, expected = "pose-jitter", "scans that agree with their neighbours"
         found = (

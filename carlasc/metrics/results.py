@@ -26,6 +26,7 @@ from carlasc.metrics.rays import RayScore
 
 Cell = str | float
 Score = Callable[[ConfusionMatrix], float]
+_LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _FEWEST_SEQUENCES = 5
 _LEVEL = 0.95  # of confidence
 _DRAWS, _SEED, _EXACT = 2000, 0, 12  # of swaps; fact: draws
@@ -57,8 +58,9 @@ class FigureTable:
     def to_markdown(self) -> str:
         """Return the table as Markdown, with the title above."""
         lines = [self.header, ["---"] + ["---:"] * (len(self.header) - 1), *self.texts()]
+        escaped = str.maketrans({"|": "\\|", "<": "&lt;"})  # HTML in a name is shown, not run
         rows = (
-            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
+            "| " + " | ".join(cell.translate(escaped) for cell in line) + " |" for line in lines
         )
         return f"{self.title}\n\n" + "\n".join(rows) + "\n"
 
@@ -66,7 +68,7 @@ class FigureTable:
         r"""Return the table as a LaTeX `tabular` with the lines of the package booktabs (\toprule,
         \midrule, \bottomrule).
         """
-        escaped = str.maketrans({letter: f"\\{letter}" for letter in "&%$#_{}"})
+        escaped = str.maketrans({letter: f"\\{letter}" for letter in "&%$#_{}"} | _LATEX)
         rows = [
             [cell.translate(escaped) for cell in row] for row in [list(self.header), *self.texts()]
         ]

@@ -60,6 +60,7 @@ class AlignmentPass(NamedTuple):
         flat: greatest variance of a plane along its normal, as a share of the variance along its
             second axis.
         wide_m2: least variance of a plane along its second axis: narrower clusters are lines.
+        joined: number of the passes before it whose planes count too.
     """
 
     cell_m: float
@@ -67,6 +68,7 @@ class AlignmentPass(NamedTuple):
     thick_m: float
     flat: float
     wide_m2: float = 0.02
+    joined: int = 0
 
 
 PASSES = (AlignmentPass(2.0, 5, 0.35, 0.1), AlignmentPass(1.0, 6, 0.12, 0.03))
@@ -93,6 +95,7 @@ def align(
     given: FloatArray,
     fixed: int = 0,
     passes: Sequence[AlignmentPass] = PASSES,
+    prior: FloatArray = _PRIOR,
 ) -> FloatArray:
     """Return the poses under which scans agree best.
 
@@ -103,6 +106,7 @@ def align(
         given: (F, 4, 4) poses of the prior, which hold where the scans do not determine a pose.
         fixed: number of scans at the beginning whose poses stay.
         passes: over the cells, one after the other.
+        prior: (4,) weights of the prior: see `_PRIOR`.
 
     Returns:
         (F, 4, 4) world_T_sensor.
@@ -112,17 +116,20 @@ def align(
         return poses
     # Large cells first: they still hold the same surface in all scans while poses are wrong by
     # decimetres. Small cells are flat where large ones are not, and decide the last centimetres.
-    for one in passes:
+    for number, one in enumerate(passes):
         for repeat in range(one.repeats):
             matrix, right = np.zeros((6 * free, 6 * free)), np.zeros(6 * free)
             # Every other step moves the cells by half, so that no surface is cut at the same places
             # in all steps. Normals are found anew in each step, and are fixed within it.
-            for block in blocks(points, poses, one.cell_m, shift=0.5 * (repeat % 2)):
-                normals, thickness = planes(block, poses, one)
-                chosen = _choose(normals, thickness)
-                slopes = _determined(normals, thickness, chosen)
-                add_planes(block, poses, normals, slopes, thickness, chosen, fixed, matrix, right)
-            add_given(poses, given, _PRIOR, fixed, matrix, right)
+            for size in passes[number - one.joined : number + 1]:
+                for block in blocks(points, poses, size.cell_m, shift=0.5 * (repeat % 2)):
+                    normals, thickness = planes(block, poses, size)
+                    chosen = _choose(normals, thickness)
+                    slopes = _determined(normals, thickness, chosen)
+                    add_planes(
+                        block, poses, normals, slopes, thickness, chosen, fixed, matrix, right
+                    )
+            add_given(poses, given, prior, fixed, matrix, right)
             move(poses, solve_positive(matrix, right).reshape(-1, 6), fixed)
     return poses
 

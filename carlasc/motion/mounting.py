@@ -34,6 +34,7 @@ _RELEVANT = np.array([0.15, 0.15, 0.15, *np.deg2rad([0.5, 0.5, 0.5]), 0.02])
 _CERTAIN = 2.5  # values within so many times their error need none either
 # least half width of an interval: scans are not corrected for motion exactly, nor interpolated
 _SYSTEMATIC = np.array([0.08, 0.08, 0.08, *np.deg2rad([0.1, 0.1, 0.1]), 0.01])
+_SHARE = 0.12  # the same as a share of the value: poses whose scale is wrong change all of it
 _GROUP, _GROUPS = 30, 3  # most scans whose errors are related, and least groups of them
 # Poses drift if what remains grows so many times over seconds, to so many least deviations.
 _GROWS, _MUCH = 1.5, 5.0
@@ -61,7 +62,7 @@ class Mounting:
     @property
     def determined(self) -> BoolArray:
         """(7,) bool: which values the drive determines."""
-        return np.asarray(self.errors < _DETERMINED)
+        return np.asarray(self.errors <= np.maximum(_DETERMINED, _SHARE * np.abs(self.values)))
 
     @property
     def wrong(self) -> BoolArray:
@@ -148,7 +149,8 @@ def find_mounting(
     longest = spans > 0.75 * spans.max()
     left = np.square(1.4826 * np.median(np.abs(scaled[longest]), axis=0))
     explained = (np.square(slope[longest] * values).mean(axis=0) / left[:, None]).max(axis=0)
-    errors = np.maximum(np.maximum(2.0 * np.sqrt(_SAME * np.diag(inverse)), apart), _SYSTEMATIC)
+    least = np.maximum(_SYSTEMATIC, _SHARE * np.abs(values))
+    errors = np.maximum(np.maximum(2.0 * np.sqrt(_SAME * np.diag(inverse)), apart), least)
     off_by = np.median(np.sqrt(left) * scale / _LEAST)
     if np.median(left) > _GROWS and off_by > _MUCH:  # drift, of which no interval is known
         errors[:] = np.inf

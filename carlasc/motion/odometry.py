@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray, IntArray
+from carlasc.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray, IntArray
 from carlasc.core.cells import distinct, first_of_cells
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import (
@@ -51,10 +51,19 @@ _CLEARLY = 1.1  # so many times the overlap make another start the better one
 _VEHICLE_M, _FAR = (1.2, 4.0), (0.95, 12.0)  # heights; a quantile of distances, and its least value
 _VOXELS, _FINE_M, _COARSE_M = 20.0, 0.1, 0.2  # voxels in half of the points' distances; limits
 _HELD = 10  # number of scans whose planes hold the next one
+_RUNS = 4  # of scans, in which drift is measured
+DRIFT_M = 0.03
+"""Poses from which scans fit farther away, within ten scans, drift."""
+# Of the prediction: metres and radians, as weights. A prior on the change of the motion would hold
+# back a carrier that sways or climbs: on stairs, a third of each such change was lost.
+_PRIOR = np.array([0.1, np.radians(4.0), np.inf, np.inf]) ** -2.0
 _PASSES = (
     AlignmentPass(2.0, 4, 0.35, 0.1, 0.008),
     AlignmentPass(1.0, 4, 0.12, 0.05, 0.008),
-    AlignmentPass(0.5, 4, 0.08, 0.03, 0.008),
+    # Together: far walls and ceilings are flat in large cells, the treads of stairs in small ones.
+    AlignmentPass(0.5, 0, 0.08, 0.03, 0.008),
+    AlignmentPass(0.25, 0, 0.04, 0.1, 0.002),
+    AlignmentPass(0.15, 4, 0.03, 0.2, 0.001, joined=2),
 )
 
 UsableScan = tuple[AnyFloatArray, AnyFloatArray | None]
@@ -214,16 +223,55 @@ class _PlaneOdometry:
         used = points.astype(np.float32)
         away = lengths(used)
         used = used[(away >= self._limits[0]) & (away <= self._limits[1])]
-        cells = np.floor(used / np.float32(self._voxel_m)).astype(np.int64)
-        self._scans.append(used[first_of_cells(cells)])
+        self._scans.append(_thinned(used, self._voxel_m))
         before, poses = self.last_pose, [*self._poses, self.last_pose @ self.last_delta]
         start = np.stack(poses)
-        aligned = align(self._scans, start, start, len(self._poses), _PASSES)[-1:]
+        aligned = align(self._scans, start, start, len(self._poses), _PASSES, _PRIOR)[-1:]
         # exactly rigid: errors would double with each scan
         self.last_pose = poses_from(quaternions_of(aligned[:, :3, :3]), aligned[:, :3, 3])[0]
         self.last_delta = invert(before) @ self.last_pose
         self._poses.append(self.last_pose)
         del self._scans[:-_HELD], self._poses[:-_HELD]
+
+
+def _thinned(points: Float32Array, voxel_m: float) -> Float32Array:
+    """Return one of the (N, 3) points in each voxel."""
+    return points[first_of_cells(np.floor(points / np.float32(voxel_m)).astype(np.int64))]
+
+
+def measure_drift(points: Callable[[int], AnyFloatArray], poses: FloatArray) -> tuple[float, bool]:
+    """Return how far scans that are of no street fit from their poses within ten scans, metres, and
+    whether they determine their height; (0, True) on a street and for fewer scans.
+
+    Some runs of scans are aligned from poses that rise too much: where nothing determines the
+    height, they stay there.
+
+    Args:
+        points: returns the (N, 3) points of the i-th scan, metres, sensor frame.
+        poses: (F, 4, 4) first_T_sensor of each scan, in order of time; rigid.
+    """
+    if len(poses) < _START:
+        return 0.0, True
+    runs = np.unique(np.linspace(0, len(poses) - _START, _RUNS).astype(int)).tolist()
+    risen, drift_m, held = np.zeros((_START, 3)), 0.0, True
+    risen[:, 2] = np.linspace(0.0, 2 * DRIFT_M, _START)
+    for first in runs:
+        read = [points(row) for row in range(first, first + _START)]
+        used = [scan[usable_points(scan), :3] for scan in read]
+        near, _, voxel_m = _look([(scan, None) for scan in used])
+        if not near:
+            break
+        given = poses[first : first + _START]
+        start = given.copy()
+        start[:, :3, 3] += risen
+        scans = [_thinned(scan.astype(np.float32), voxel_m) for scan in used]
+        off = (align(scans, start, start, 1, _PASSES, _PRIOR) - given)[:, :3, 3]
+        far, left = (float(np.linalg.norm(way, axis=1).max()) for way in (off, off - risen))
+        if DRIFT_M < far < 2.5 * DRIFT_M and left < far:  # about where they were put
+            held = False
+        else:
+            drift_m = max(drift_m, far)
+    return drift_m, held
 
 
 def _find_start(

@@ -31,7 +31,7 @@ from carlasc.core.arrays import (
 from carlasc.core.cameras import CameraModel
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points
-from carlasc.errors import FormatError, MissingDataError, check_types
+from carlasc.errors import FormatError, MissingDataError, check_types, reading
 from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
 from carlasc.groundtruth.options import FromScans, Voting
@@ -61,6 +61,7 @@ from carlasc.storage.class_files import read_classes
 from carlasc.storage.derived_copies import sequences_with_scans
 from carlasc.storage.files import AnyPath
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
+from carlasc.storage.shares import Share
 
 _SUFFIXES = (".png", ".npy")
 _FIELD = "image_labels"  # of the layout
@@ -138,13 +139,13 @@ def label_images(
     root = None if pixels is None else Path(pixels)
     by = by if by is not None else "images" if root is None else root.resolve().name
     table = None if classes is None else read_classes(classes)[0]
-    source = as_source(source)
-    given = sequences_with_scans(source)
+    share = Share(as_source(source), run)
+    given = sequences_with_scans(share)
     shown = {path: PixelClasses.find(one, root) for path, one in given.items()}
     inputs = scan_sequences_of(given, observe)
     files = (path for one in shown.values() for path in one.paths())
     settings = {"observe": repr(observe), "pixels": digest_of_files(files), "by": by}
-    copy = begin_predicted(source, out, settings, table, overwrite, run)
+    copy = begin_predicted(share, out, settings, table, overwrite, run)
 
     def find(
         path: str, writer: SequenceWriter | None, pool: Run, step: StepCounter
@@ -153,7 +154,7 @@ def label_images(
         reader = PredictionReader.of(table, given[path], logits=False)
         return _ShownSequence(inputs[path], shown[path], reader, by)
 
-    labelled, copied = write_in_stages(copy, given, find, run, scans=0, made=PREDICTED_FIELDS)
+    labelled, copied = write_in_stages(copy, given, find, share.run, scans=0, made=PREDICTED_FIELDS)
     return LabelResult.of(copied, began, by, labelled.values())
 
 
@@ -222,7 +223,9 @@ class PixelClasses:
         if path is None:
             return None
         if path.suffix == ".png":
-            return decode_image(path.read_bytes(), str(path), camera, color=False)
+            with reading(path, "a file that can be read"):
+                data = path.read_bytes()
+            return decode_image(data, str(path), camera, color=False)
         array = read_npy(path, ArrayFormat(NUMBERS, None))
         size, is_float = (camera.height, camera.width), array.dtype.kind == "f"
         if array.ndim != 2 + is_float or array.shape[:2] != size:

@@ -31,6 +31,7 @@ from carlasc.storage.derived_copies import (
 )
 from carlasc.storage.files import AnyPath
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
+from carlasc.storage.shares import Share
 
 _WRITTEN = ("flow", "instances")
 _FOUND = "found by carlasc from "  # words of carlasc.json about motion, before its source
@@ -94,11 +95,11 @@ def label_motion(
         raise ArgumentError(
             "observe", expected='dynamic="align", and something that shows motion', found=found
         )
-    source = as_source(source)
-    given = sequences_with_scans(source)
+    share = Share(as_source(source), run)
+    given = sequences_with_scans(share)
     inputs = scan_sequences_of(given, observe)
     copy = DerivedCopy(
-        source,
+        share,
         out,
         {"observe": repr(observe)},
         kind="motion found by carlasc",
@@ -114,7 +115,7 @@ def label_motion(
         return _MovingSequence(given[path], inputs[path].feed, inputs[path].actors)
 
     scans = sum(one.steps_before for one in inputs.values())
-    moving, copied = write_in_stages(copy, given, find, run, scans=scans, made=_WRITTEN)
+    moving, copied = write_in_stages(copy, given, find, share.run, scans=scans, made=_WRITTEN)
     notes = [note for one in inputs.values() for note in one.notes() if "grids" not in note]
     tables = [one.metadata.classes for one in given.values()]
     lacking = sorted({table.name for table in tables if not table.standing})

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
@@ -26,7 +26,7 @@ from carlasc.core.arrays import (
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.tables import remaps_between, to_table
-from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_types
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_types, reading
 from carlasc.relabelling.copies import (
     PREDICTED_FIELDS,
     LabelResult,
@@ -41,6 +41,7 @@ from carlasc.storage.class_files import read_classes
 from carlasc.storage.derived_copies import sequences_with_scans
 from carlasc.storage.files import AnyPath
 from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.shares import Share
 
 SUFFIXES = (".label", ".npy", ".npz")
 _LEAVES = ("labels", "predictions")  # names of folders with the files of one sequence
@@ -101,19 +102,22 @@ def label(
     """
     check_types(label, locals())
     began = time.perf_counter()
-    source, root = as_source(source), Path(predictions)
+    share, root = Share(as_source(source), run), Path(predictions)
     by = root.resolve().name if by is None else by
     table = None if classes is None else read_classes(classes)[0]
-    chosen, scans = FrameRange.of(frames), sequences_with_scans(source)
-    files = find_predictions(root, scans, chosen)
+    chosen, scans = FrameRange.of(frames), sequences_with_scans(share)
+    others = {place.rpartition("/")[2] for place in share.others} - {
+        one.name for one in scans.values()
+    }
+    files = find_predictions(root, scans, chosen, others)
     sequences = {
         path: _LabelledSequence(one, files[path], PredictionReader.of(table, one, logits), by)
         for path, one in scans.items()
     }
     paths = (one.path(frame) for one in files.values() for frame in one.frames)
     settings = {"frames": str(chosen), "logits": logits, "predictions": digest_of_files(paths)}
-    copy = begin_predicted(source, out, {**settings, "by": by}, table, overwrite, run)
-    return LabelResult.of(copy.write(sequences, run), began, by, sequences.values())
+    copy = begin_predicted(share, out, {**settings, "by": by}, table, overwrite, run)
+    return LabelResult.of(copy.write(sequences, share.run), began, by, sequences.values())
 
 
 @dataclass(frozen=True)
@@ -130,9 +134,13 @@ class PredictedFiles:
 
 
 def find_predictions(
-    root: Path, sequences: Mapping[str, Sequence], chosen: FrameRange
+    root: Path,
+    sequences: Mapping[str, Sequence],
+    chosen: FrameRange,
+    left_out: Collection[str] = (),
 ) -> dict[str, PredictedFiles]:
-    """Return the files of the chosen frames of each sequence.
+    """Return the files of the chosen frames of each sequence. Folders with some names are
+    not listed.
 
     The files of a sequence are in the only folder whose path contains the name of the sequence, and
     no name of another split or other coordinates. If there are several such folders, the one named
@@ -144,7 +152,8 @@ def find_predictions(
         FormatError: a sequence has several folders, or a folder has files with several suffixes.
     """
     by_folder: dict[tuple[str, ...], PredictedFiles] = {}
-    for folder, _, names in os.walk(root):
+    for folder, below, names in os.walk(root):
+        below[:] = [name for name in below if name not in left_out]
         for suffix in SUFFIXES:
             stems = [
                 name.removesuffix(suffix)
@@ -167,7 +176,7 @@ def find_predictions(
         matching = [
             parts for parts in by_folder if sequence.name in parts and not others & set(parts)
         ]
-        if not matching and len(sequences) == 1:
+        if not matching and len(sequences) == 1 and not left_out:
             matching = [parts for parts in by_folder if "/".join(parts) in ("", *_LEAVES)]
         matching = [parts for parts in matching if parts and parts[-1] in _LEAVES] or matching
         if len(matching) != 1:
@@ -336,7 +345,8 @@ def load(path: Path) -> tuple[AnyArray | None, AnyArray | None]:
                 found=found,
             )
         return (None, array) if is_float else (array, None)
-    data = path.read_bytes()
+    with reading(path, "a file that can be read"):
+        data = path.read_bytes()
     if len(data) % 4:
         raise FormatError(
             path, expected="a multiple of 4 bytes (uint32 per point)", found=str(len(data))

@@ -40,6 +40,7 @@ from carlasc.storage.files import AnyPath
 from carlasc.storage.inputs import digest_of_bytes
 from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
+from carlasc.storage.shares import Share
 
 _RUN = 60  # number of scans in a run, for the mounting of the sensor
 # words for poses in carlasc.json
@@ -87,7 +88,7 @@ def refine(
             have none, are refined too.
         overwrite: replace a data set at `out` that `refine` has made.
         run: how the work is spread. Steps of progress are scans, then files. Each part refines the
-            poses of all sequences.
+            poses of its own sequences.
 
     Returns:
         The files that were written, and what was done to the poses of each sequence.
@@ -105,8 +106,8 @@ def refine(
     began = time.perf_counter()
     if poses.refine == "never":
         raise ArgumentError("refine", expected="auto or always", found="'never'")
-    source, options = as_source(source), FromScans(poses=poses)
-    given = sequences_with_scans(source)
+    share, options = Share(as_source(source), run), FromScans(poses=poses)
+    given = sequences_with_scans(share)
     for one in given.values():
         if not must_estimate(one, options):
             check_trajectory(one, options)
@@ -117,7 +118,7 @@ def refine(
         if "/" not in name
     ]
     copy = DerivedCopy(
-        source,
+        share,
         out,
         {"poses": vars(poses), "texts": digest_of_bytes(b"\0".join(texts)).hex()},
         kind="refined poses",
@@ -132,7 +133,7 @@ def refine(
         return _refine(given[path], options, writer, pool, step)
 
     scans = sum(len(one.frames("points")) for one in given.values())
-    refined, copied = write_in_stages(copy, given, find, run, scans=scans)
+    refined, copied = write_in_stages(copy, given, find, share.run, scans=scans)
     return RefineResult(
         **timed(copied, began),
         refined=[path for path, one in refined.items() if one.scans],

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
+from hashlib import sha256
 from typing import Any, Protocol, Self, TypeVar
 
 from carlasc.errors import ArgumentError, check_types
@@ -105,6 +106,30 @@ class Part:
         )
         return items[begin:end]
 
+    def share(self, names: Sequence[str]) -> tuple[list[str], Part]:
+        """Return the names of this part, and how it shares each of them with other parts.
+
+        Whole names are dealt by a digest of each, so that a name stays in its part when others are
+        added. If the parts outnumber the names, several parts share one name.
+
+        Args:
+            names: names of sequences.
+
+        Returns:
+            The names of this part, and which part of each it does.
+        """
+        size = len(names)
+        if self.count > size > 0:
+            index = (self.number - 1) * size // self.count
+            first, end = (-(-at * self.count // size) for at in (index, index + 1))
+            return [names[index]], Part(self.number - first, end - first)
+        own = [name for name in names if self.count == 1 or self._owns(name)]
+        return own, Part()
+
+    def _owns(self, name: str) -> bool:
+        digest = sha256(name.encode(errors="surrogateescape")).digest()
+        return int.from_bytes(digest[:8], "big") % self.count == self.number - 1
+
     def refuse(self, overwrite: bool) -> None:
         """Check that `overwrite` is not combined with several parts, because a part would remove
         the output of others.
@@ -135,6 +160,9 @@ class Run:
             new processes.
         part: the part of the work to do; other commands do the other parts, at the same time or
             later.
+        sequences_from: file with the folders of the sequences to work on, relative to the source,
+            one per line. If it does not exist, it is written, so that the other parts need not list
+            the source. None: the source is listed.
         progress: called with the number of finished steps and the number of all steps.
 
     Raises:
@@ -144,6 +172,7 @@ class Run:
     workers: int | None = None
     executor: Engine | None = None
     part: Part = Part()
+    sequences_from: str | os.PathLike[str] | None = None
     progress: Callable[[int, int], None] | None = None
 
     def __post_init__(self) -> None:
@@ -155,6 +184,11 @@ class Run:
     def processes(self) -> int:
         """Number of processes: `workers`, or one per core that this process may use."""
         return count_cores() if self.workers is None else self.workers
+
+    @property
+    def is_share(self) -> bool:
+        """Whether the run may work on some sequences of its source only."""
+        return self.part.count > 1 or self.sequences_from is not None
 
     @property
     def is_alone(self) -> bool:

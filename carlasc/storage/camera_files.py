@@ -13,7 +13,7 @@ from carlasc.core.arrays import AnyArray, LabelArray, Uint8Array
 from carlasc.core.cameras import CameraModel
 from carlasc.core.choices import Axes
 from carlasc.core.geometry import Transform, invert, slerp
-from carlasc.errors import FormatError, MissingDataError, import_extra
+from carlasc.errors import FormatError, MissingDataError, import_extra, reading
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.protocol import Sequence
@@ -196,7 +196,8 @@ def image_bytes(
             raise MissingDataError(
                 where, expected=f"an image of the camera {camera.name}", found="no file"
             )
-        return path.read_bytes(), where
+        with reading(where, "an image"):
+            return path.read_bytes(), where
     raise MissingDataError(
         sequence.location,
         expected=f"{folder}/{camera.name}/{frame:06d}.jpg or .png",

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Series
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -24,7 +24,8 @@ from carlasc.storage.files import AnyPath, unfinished
 from carlasc.storage.folder import FolderSink
 from carlasc.storage.opening import as_source
 from carlasc.storage.packed.output import put_in_place
-from carlasc.storage.protocol import Sequence, SequenceWriter, Source
+from carlasc.storage.protocol import Sequence, SequenceWriter, Sink, Source
+from carlasc.storage.shares import Share
 from carlasc.storage.transport.remote_tree import check_shared
 from carlasc.storage.transport.trees import is_url
 
@@ -235,18 +236,26 @@ def unpack(
             found="a folder" if final.is_dir() else "a file",
             advice="choose another name, or give `overwrite=True`",
         )
-    sink, blocks = FolderSink(result.out if final is None else unfinished(final)), []
-    for path, sequence in source.sequences().items():
+    share, sink = Share(source, run), FolderSink(result.out if final is None else unfinished(final))
+    write_files(share.sequences(), sink, result, share.run, again=overwrite)
+    if final is not None:
+        put_in_place(unfinished(final), final, overwrite=False)
+    result.elapsed_s = time.perf_counter() - began
+    return result
+
+
+def write_files(
+    sequences: Mapping[str, Sequence], sink: Sink, result: UnpackResult, run: Run, *, again: bool
+) -> None:
+    """Write the sequences of a part of a run, and add to the result what was written."""
+    blocks = list[FrameBlock]()
+    for path, sequence in sequences.items():
         result.sequences.append(path)
         writer = sink.sequence(path)
-        if overwrite:
+        if again:
             for name in sequence.documents():
                 writer.write_document(name, sequence.read_document(name))
         else:
             copy_documents(sequence, writer)
         blocks += blocks_of(sequence, writer, _BLOCK)
-    result.files, result.kept = copy_blocks(blocks, run, again=overwrite)
-    if final is not None:
-        put_in_place(unfinished(final), final, overwrite=False)
-    result.elapsed_s = time.perf_counter() - began
-    return result
+    result.files, result.kept = copy_blocks(blocks, run, again=again)

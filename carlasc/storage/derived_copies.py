@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,7 +25,7 @@ from carlasc.core.arrays import AnyArray, IntArray
 from carlasc.errors import CarlascError, CompleteError, ConflictError, MissingDataError
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
-from carlasc.storage.copying import UnpackResult, refuse_overlap, unpack
+from carlasc.storage.copying import UnpackResult, refuse_overlap, unpack, write_files
 from carlasc.storage.files import (
     AnyPath,
     has_content,
@@ -41,6 +41,7 @@ from carlasc.storage.inputs import sequence_states
 from carlasc.storage.layout import Metadata
 from carlasc.storage.packed.output import remove
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
+from carlasc.storage.shares import Share
 from carlasc.storage.transport.trees import is_url
 from carlasc.storage.views import ChosenSequences, SequenceView
 
@@ -146,13 +147,13 @@ class DerivedSequence(SequenceView):
 
 
 def sequences_with_scans(source: Source) -> dict[str, Sequence]:
-    """Return the sequences of a source that have points, by path.
+    """Return the sequences of a source that have points, by path; a part may have none.
 
     Raises:
         MissingDataError: no sequence has points.
     """
     found = {path: one for path, one in source.sequences().items() if len(one.frames("points"))}
-    if not found:
+    if not (found or (isinstance(source, Share) and source.others)):
         raise MissingDataError(source.location, expected="sequences with points", found="none")
     return found
 
@@ -201,15 +202,22 @@ class DerivedCopy:
         run.part.refuse(overwrite)
         refuse_overlap(out, source)
         self.source, self.out, self.overwrite = source, out, overwrite
+        self.is_part = run.part.count > 1
         self.mark: Path | None = None
-        if not is_url(out) and run.part.count == 1:
+        if not (is_url(out) or self.is_part):
             inputs = sequence_states(source)
             settings = {"source": source.location, "kind": kind, "inputs": inputs, **made_from}
-            if not overwrite and has_content(record := Path(out) / _RECORD):
-                check_complete(out, record.read_bytes() == to_json(settings))
-            _clear(Path(out), kind, is_kind, overwrite=overwrite)
-            with _naming_replaced(Path(out)):
-                self.mark = _mark(unfinished(Path(out)), settings, overwrite=overwrite)
+            self.mark = _mark_of(unfinished(Path(out)))
+            if not overwrite and Path(out).exists():
+                if self._was_finished(to_json(settings)):
+                    self._finish(FolderSource(out).sequences())
+                if has_content(record := Path(out) / _RECORD):
+                    check_complete(out, record.read_bytes() == to_json(settings))
+            _check_replaceable(Path(out), kind, is_kind, overwrite=overwrite)
+            _begin(self.mark, unfinished(Path(out)), to_json(settings), overwrite=overwrite)
+            if Path(out).exists():  # an older copy, which is removed when the new one is complete
+                remove(replaced(Path(out)))
+                Path(out).rename(replaced(Path(out)))
 
     def writer(self, path: str) -> SequenceWriter | None:
         """Return the writer for data derived from a sequence, kept until the copy is complete; None
@@ -222,7 +230,7 @@ class DerivedCopy:
 
         Args:
             sequences: the sequences by path.
-            run: how the work is distributed. Progress counts files.
+            run: how the work on these is distributed. Progress counts files.
 
         Raises:
             StorageError: the files cannot be written.
@@ -234,20 +242,36 @@ class DerivedCopy:
         chosen = ChosenSequences(self.source.location, sequences)
         aside = self.overwrite and self.mark is None
         with _naming_replaced(Path(self.out)):
-            copied = unpack(chosen, self.out, overwrite=aside, run=run)
-        if self.mark is not None:
-            for path in sequences:
-                shutil.rmtree(Path(self.out) / path / layout.DERIVED, ignore_errors=True)
-            write_atomic(Path(self.out) / _RECORD, self.mark.read_bytes())
-            self.mark.unlink(missing_ok=True)
-            if self.overwrite:
-                remove(replaced(Path(self.out)))
+            if self.is_part:
+                copied = UnpackResult(str(self.out) if is_url(self.out) else Path(self.out))
+                write_files(sequences, FolderSink(self.out), copied, run, again=False)
+            else:
+                copied = unpack(chosen, self.out, overwrite=aside, run=run)
+        self._finish(sequences)
         return CopyResult(
             **vars(copied)
             | {"kept": copied.kept - linked, "elapsed_s": time.perf_counter() - began},
             linked=linked,
             left_out=sorted({name for one in sequences.values() for name in one.left_out}),
         )
+
+    def _was_finished(self, settings: bytes) -> bool:
+        """Whether a killed run had these settings, and all files of the copy have their place."""
+        mark = self.mark
+        if mark is None or unfinished(Path(self.out)).exists() or not has_content(mark):
+            return False
+        return mark.read_bytes() == settings
+
+    def _finish(self, paths: Iterable[str]) -> None:
+        """Write the record of the copy, and remove what was kept until it is complete."""
+        if self.mark is None:
+            return
+        for path in paths:
+            shutil.rmtree(Path(self.out) / path / layout.DERIVED, ignore_errors=True)
+        write_atomic(Path(self.out) / _RECORD, self.mark.read_bytes())
+        self.mark.unlink(missing_ok=True)
+        if self.overwrite:
+            remove(replaced(Path(self.out)))
 
 
 @contextmanager
@@ -273,8 +297,10 @@ def check_complete(out: AnyPath, is_complete: bool) -> None:
         raise CompleteError(out, problem=problem, advice=advice)
 
 
-def _clear(out: Path, kind: str, is_kind: Callable[[Metadata], bool], *, overwrite: bool) -> None:
-    """Move an older copy aside, if it may be replaced. It is removed when the new copy is complete.
+def _check_replaceable(
+    out: Path, kind: str, is_kind: Callable[[Metadata], bool], *, overwrite: bool
+) -> None:
+    """Check that nothing is at `out`, or an older copy that may be replaced.
 
     Raises:
         ConflictError: the existing files may not be replaced.
@@ -289,18 +315,20 @@ def _clear(out: Path, kind: str, is_kind: Callable[[Metadata], bool], *, overwri
     ):
         expected, advice = f"a data set with {kind} to overwrite", "choose another name"
         raise ConflictError(out, expected=expected, found="something else", advice=advice)
-    remove(replaced(out))
-    out.rename(replaced(out))
 
 
-def _mark(folder: Path, settings: Mapping[str, Any], *, overwrite: bool) -> Path:
-    """Write input and options of an unfinished copy into a file beside it, and return that file.
+def _mark_of(folder: Path) -> Path:
+    """Return the file beside an unfinished copy that records its input and options."""
+    return folder.with_name(f"{folder.name}.json")
+
+
+def _begin(mark: Path, folder: Path, data: bytes, *, overwrite: bool) -> None:
+    """Write input and options of an unfinished copy into its mark.
 
     Raises:
         ConflictError: the folder holds the files of an interrupted run with another input or other
             options.
     """
-    mark, data = folder.with_name(f"{folder.name}.json"), to_json(dict(settings))
     before = mark.read_bytes() if mark.is_file() else None
     if folder.exists() and before != data:
         if before is None or not overwrite:
@@ -310,7 +338,6 @@ def _mark(folder: Path, settings: Mapping[str, Any], *, overwrite: bool) -> Path
             )
         shutil.rmtree(folder)
     write_atomic(mark, data)
-    return mark
 
 
 def _link_files(sequence: DerivedSequence, folder: Path) -> int:

@@ -12,6 +12,7 @@ import glob
 import json
 import os
 import re
+import shutil
 import socket
 import sys
 import threading
@@ -155,8 +156,33 @@ def write_output(path: Path, content: Content) -> None:
 
     To write many files into a folder, call `remove_stale` once instead.
     """
-    _remove_ended(path.parent.glob(f".{glob.escape(path.name)}.*{_PART}"))
+    remove_stale_of(path)
     write_atomic(path, content)
+
+
+def remove_stale_of(path: Path) -> None:
+    """Remove what killed processes left of a file that they wrote."""
+    _remove_ended(path.parent.glob(f".{glob.escape(path.name)}.*{_PART}"))
+
+
+@contextmanager
+def temporary_folder(beside: Path) -> Iterator[Path]:
+    """Make a folder beside an output file, and remove it at the end.
+
+    Raises:
+        StorageError: it cannot be written to; names the output.
+    """
+    folder = _temporary(beside)
+    try:
+        beside.parent.mkdir(parents=True, exist_ok=True)
+        folder.mkdir()
+        yield folder
+    except OSError as error:
+        if error.filename and not Path(error.filename).is_relative_to(beside.parent):
+            raise
+        raise storage_error(beside, error) from error
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def check_target(out: Path, endings: tuple[str, ...], overwrite: bool) -> None:
@@ -198,7 +224,7 @@ def _remove_ended(parts: Iterable[Path]) -> None:
             if (
                 match and not _is_alive(int(match[1]))
             ) or time.time() - part.stat().st_mtime > 86400:
-                part.unlink()
+                (shutil.rmtree if part.is_dir() else Path.unlink)(part)
         except FileNotFoundError:
             continue  # its writer finished meanwhile
 

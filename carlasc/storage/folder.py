@@ -58,7 +58,7 @@ class FolderSource(PublishedSource):
         """
         sequences: dict[str, Sequence] = {}
         try:
-            sequences = {path: FolderSequence(self.folder, path) for path in super().sequences()}
+            sequences = {**super().sequences()}
         except MissingDataError:
             if (found := find_voxels(self.folder)) is None:
                 raise
@@ -67,6 +67,9 @@ class FolderSource(PublishedSource):
         is_other = not any(sequence.fields() for sequence in sequences.values())
         voxels = find_voxels(self.folder) if is_other else None
         return sequences if voxels is None else voxels.sequences()
+
+    def _sequence(self, path: str) -> FolderSequence:
+        return FolderSequence(self.folder, path)
 
 
 class FolderSequence(PublishedSequence):
@@ -239,6 +242,10 @@ class FolderWriter(SequenceWriter):
     def write_document(self, name: str, data: bytes) -> None:
         """Write a text file."""
         self.target.put(name, data)
+
+    def remove_document(self, name: str) -> None:
+        """Remove a text file, if it exists."""
+        self.target.remove(name)
 
     def create_document(self, name: str, data: bytes) -> bool:
         """Write a text file unless it exists. An empty one is replaced."""

@@ -24,7 +24,7 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray
 from carlasc.core.choices import CompareInputs
-from carlasc.errors import CarlascError, count, first_names, first_runs
+from carlasc.errors import CarlascError, count, first_names, first_runs, tried_twice
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
@@ -32,11 +32,8 @@ from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 from carlasc.storage.transport.trees import Tree
 
-UNKNOWN = (
-    "there is no record of what existing frames were made from: they are kept; "
-    '`compare_inputs="content"` compares them'
-)
-"""The note on outputs of an older version, or whose record was deleted."""
+ACCEPTED = "accepted"
+"""In the place of the digest of a frame: it counts as made of the inputs in the record."""
 _FORMAT = 1
 _BYTES = 16  # of the digest of a file
 _SHORT = 8  # bytes of the digests in records
@@ -172,14 +169,13 @@ def content_digests(
 
 def _digests(files: FrameFiles, frames: list[int]) -> list[str]:
     """Return the digests of some frames, in a worker."""
-    digests = []
-    for frame in frames:
-        digests.append(_UNREADABLE)
-        for _ in range(2):  # a second try, because a temporary error is not a change
-            with suppress(CarlascError, OSError):  # it is reported when the frame is used
-                digests[-1] = combined(*files.contents(frame))
-                break
-    return digests
+    # an error is reported when the frame is used
+    found = list(map(tried_twice, [partial(_digest, files, frame) for frame in frames]))
+    return [digest or _UNREADABLE for digest in found]
+
+
+def _digest(files: FrameFiles, frame: int) -> str:
+    return combined(*files.contents(frame))
 
 
 def _states(files: FrameFiles, frames: list[int]) -> dict[int, str]:
@@ -203,10 +199,10 @@ def sequence_states(source: Source, *more: str) -> dict[str, str]:
     for path, sequence in source.sequences().items():
         own = [name for name in sequence.fields() if "/" not in name]
         files = SequenceFiles(sequence, *own, *more)
-        texts = [(name, sequence.read_document(name)) for name in sequence.documents()]
+        frames = {frame for name in files.fields for frame in sequence.frames(name).tolist()}
+        texts = [name for name in sequence.documents() if "/" not in name]
         states[path] = combined(
-            _states(files, sequence.scan_frames().tolist()),
-            [text for text in texts if "/" not in text[0]],
+            _states(files, sorted(frames)), [(name, sequence.read_document(name)) for name in texts]
         )
     return states
 

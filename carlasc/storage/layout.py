@@ -155,6 +155,12 @@ def identity_of(path: str) -> tuple[str | None, str, Coordinates]:
     return split, name, cast(Coordinates, coordinates)
 
 
+def place_of(path: str) -> str:
+    """Return the path of a sequence without its `<coordinates>`."""
+    head, _, last = path.rpartition("/")
+    return head if last in COORDINATES else path
+
+
 def field_named(name: str) -> Field:
     """Return the field with a flat name such as `points` or `evaluation/labels`.
 

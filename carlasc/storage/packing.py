@@ -31,6 +31,7 @@ from carlasc.storage.opening import as_source, open, open_sink
 from carlasc.storage.packed.stores import PackedSink, PackedSource, PackOptions, check_names
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.published import PublishedSequence
+from carlasc.storage.shares import Share
 from carlasc.storage.transport.trees import is_url
 
 if TYPE_CHECKING:
@@ -128,7 +129,8 @@ def pack(
     source = as_source(source)
     refuse_overlap(out, source)
     result = PackResult(str(out) if is_url(out) else Path(out))
-    sequences = source.sequences()
+    share = Share(source, run)
+    sequences = share.sequences()
     check_names([*sequences], source.location)
     for path, sequence in sequences.items():
         result.sequences.append(path)
@@ -140,7 +142,7 @@ def pack(
         if isinstance(sink, PackedSink):
             result.published_bytes = _append(sequences, sink, run.progress, run.workers or _AHEAD)
             sink.finish()
-        elif not _pack_blocks(sequences, sink, run):
+        elif not _pack_blocks(share, sequences, sink, run):
             return replace(result, elapsed_s=time.perf_counter() - began)
     except OSError as error:  # of the store; sources raise their own errors
         raise storage_error(result.out, error) from error
@@ -151,7 +153,7 @@ def pack(
     return result
 
 
-def _pack_blocks(sequences: Mapping[str, Sequence], sink: ZarrSink, run: Run) -> bool:
+def _pack_blocks(share: Share, sequences: Mapping[str, Sequence], sink: ZarrSink, run: Run) -> bool:
     """Pack the blocks of one part of the run, in any number of processes, and return whether the
     store is finished.
     """
@@ -171,13 +173,17 @@ def _pack_blocks(sequences: Mapping[str, Sequence], sink: ZarrSink, run: Run) ->
         fields = {name: sequence.frames(name).tolist() for name in sequence.fields()}
         writer.expect(fields, typical_rows(sequence))
         blocks += blocks_of(sequence, writer, writer.block)
-    copy_blocks(blocks, run)
+    copy_blocks(blocks, share.run)
     for writer in writers:
         writer.close()
     for writer in writers:
         writer.refresh()
-    if run.part.count > 1 and any(block.missing().files for block in blocks):
-        return False  # another part finishes the store
+    if run.part.count > 1:
+        paths = (path for place in share.others for path in share.whole.sequences_in([place]))
+        if any(block.missing().files for block in blocks) or not all(
+            sink.sequence(path).is_complete() for path in paths
+        ):
+            return False  # another part finishes the store
     sink.finish()
     return True
 

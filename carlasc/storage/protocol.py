@@ -474,6 +474,18 @@ class Source(Mapping[str, Sequence]):
     def sequences(self) -> Mapping[str, Sequence]:
         """Return the sequences by path, in sorted order."""
 
+    def places(self) -> list[str]:
+        """Return the sorted folders of sequences and captures, without opening them: a path of a
+        sequence without `<coordinates>`. A folder may hold none.
+        """
+        return sorted({layout.place_of(path) for path in self.sequences()})
+
+    def sequences_in(self, places: Collection[str]) -> Mapping[str, Sequence]:
+        """Return the sequences in some of `places()`, by path, in sorted order."""
+        chosen = {*places}
+        found = self.sequences().items()
+        return {path: one for path, one in found if layout.place_of(path) in chosen}
+
     def __getitem__(self, path: str) -> Sequence:
         """Return a sequence by its path.
 
@@ -591,6 +603,9 @@ class SequenceWriter(ABC):
     def write_document(self, name: str, data: bytes) -> None:
         """Write the bytes of a text file; an existing file is replaced."""
 
+    def remove_document(self, name: str) -> None:  # noqa: B027 (finished stores cannot change)
+        """Remove a text file, if it exists and the store can remove it."""
+
     def create_document(self, name: str, data: bytes) -> bool:
         """Write a text file unless it exists, and return whether it was written.
 
@@ -622,6 +637,10 @@ class SequenceWriter(ABC):
             if data is not None:
                 return math.prod(GridSpec.from_params(parse_json(data, where), where).size)
         return None
+
+    def is_complete(self) -> bool:
+        """Whether the sequence has all announced frames; False if the store does not know."""
+        return False
 
     def remove_grid(self, grid: str) -> None:
         """Remove a grid.

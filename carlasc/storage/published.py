@@ -4,8 +4,9 @@ field.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cached_property
+from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -38,10 +39,28 @@ class PublishedSource(Source):
         Raises:
             MissingDataError: no sequence was found; the message says what was expected and found.
         """
-        paths = sorted(_find_sequences(self.tree, "", _DEPTH))
-        if not paths:
+        if not (found := self.sequences_in([""])):
             raise self._nothing_found()
-        return {path: PublishedSequence(self.tree, path) for path in paths}
+        return found
+
+    def places(self) -> list[str]:
+        """Return the folders as deep as the first sequence or capture: only folders above are
+        listed.
+        """
+        first = _first_place(self.tree, "", _DEPTH)
+        depth = len(first.split("/")) if first else 0
+        return list(_folders_at(self.tree, "", depth))
+
+    def sequences_in(self, places: Collection[str]) -> Mapping[str, Sequence]:
+        """Return the sequences in some folders."""
+        paths = list[str]()
+        for place in places:
+            depth = _DEPTH - len(PurePosixPath(place).parts)
+            paths += _find_sequences(self.tree, place, depth)
+        return {path: self._sequence(path) for path in sorted(paths)}
+
+    def _sequence(self, path: str) -> PublishedSequence:
+        return PublishedSequence(self.tree, path)
 
     def _nothing_found(self) -> MissingDataError:
         entries, expected = self.tree.entries(), "a sequence or a folder above it"
@@ -197,6 +216,38 @@ class PublishedSequence(Sequence):
 def _marks() -> frozenset[str]:
     """Return the names by which a `<coordinates>` folder is recognised."""
     return layout.scan_folders() | {layout.EVALUATION, layout.POSES}
+
+
+def _is_place(names: Iterable[str]) -> bool:
+    """Whether a folder with these entries is that of a sequence or of a capture."""
+    known = {*_marks(), *layout.COORDINATES, "raw"}
+    return any(name in known or name.startswith(f"{layout.EVALUATION}_") for name in names)
+
+
+def _first_place(tree: Tree, path: str, depth: int) -> str | None:
+    """Return the first folder of a sequence or a capture, in sorted order."""
+    entries = tree.entries(path)
+    if _is_place(entries):
+        return path
+    for name in _folders(entries) if depth else ():
+        if (found := _first_place(tree, f"{path}/{name}".lstrip("/"), depth - 1)) is not None:
+            return found
+    return None
+
+
+def _folders_at(tree: Tree, path: str, depth: int) -> Iterator[str]:
+    """Yield the folders at a depth, and those of sequences and captures above it."""
+    entries = tree.entries(path) if depth else {}
+    if not depth or _is_place(entries):
+        yield path
+        return
+    for name in _folders(entries):
+        yield from _folders_at(tree, f"{path}/{name}".lstrip("/"), depth - 1)
+
+
+def _folders(entries: Mapping[str, bool]) -> list[str]:
+    found = [name for name, is_folder in entries.items() if is_folder]
+    return sorted(name for name in found if not name.startswith("."))
 
 
 def _find_sequences(tree: Tree, path: str, depth: int) -> Iterator[str]:

@@ -153,7 +153,12 @@ def _first_difference(existing: dict[str, Any], wanted: dict[str, Any]) -> str |
 
 
 def agree_lines(
-    writer: SequenceWriter, document: str, ours: FloatArray | None, *, is_whole: bool = False
+    writer: SequenceWriter,
+    document: str,
+    ours: FloatArray | None,
+    *,
+    is_whole: bool = False,
+    may_change: Callable[[], bool] = lambda: False,
 ) -> bytes | None:
     """Return the poses.txt or times.txt to write; None if there is nothing to write.
 
@@ -165,6 +170,7 @@ def agree_lines(
         document: name of the file.
         ours: (F, 4, 4) first_T_sensor, or (F,) seconds, of this run; None if it has none.
         is_whole: whether more lines of an earlier run are left out.
+        may_change: returns whether lines that are different are replaced.
 
     Raises:
         ConflictError: an existing line is different; the message names the frame.
@@ -179,6 +185,8 @@ def agree_lines(
     both = min(len(existing), len(ours))
     differs = np.abs(existing[:both] - ours[:both]) > _TOLERANCE  # False if either is NaN
     if differs.any():
+        if may_change():
+            return encode(ours)
         raise _other_data(where, int(np.argwhere(differs)[0, 0]))
     merged = np.concatenate([existing, ours[both:]])
     merged[:both] = np.where(np.isnan(existing[:both]), ours[:both], existing[:both])

@@ -334,19 +334,20 @@ class ScanFolder(Recording):
                     found=f"{len(stamps)} times",
                 )
             return stamps, str(self._options.time_file)
-        rows, given = None if self._poses is None else self._poses.stamps, None
+        rows, given = None if self._poses is None else self._poses.stamps, []
         if self._clock is not None and self._clock.absolute:
-            given = self._starts(self._clock), "the times of points"
-        elif (names := stamps_of_names([path.stem for path in self._paths])) is not None:
-            given = names, "the names of the files"
-        if given is not None and (rows is None or _together(given[0], rows)):
-            return given
+            given.append((self._starts(self._clock), "the times of points"))
+        if (names := stamps_of_names([path.stem for path in self._paths])) is not None:
+            given.append((names, "the names of the files"))
+        for stamps, source in given:
+            if rows is None or _together(stamps, rows):
+                return stamps, source
         if rows is not None and len(rows) == count:
             return (
                 rows,
                 f"{self._options.pose_file or 'data'}, whose lines go by the order of the scans",
             )
-        return given or (None, "")
+        return given[0] if given else (None, "")
 
     def _starts(self, clock: PointClock) -> IntArray:
         """Return the (F,) nanoseconds of the first point of each scan; between those of the others

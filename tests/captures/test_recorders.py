@@ -94,3 +94,9 @@ def test_what_cannot_be_loaded_or_is_no_simulator_is_refused(installed, tmp_path
         simulate(tmp_path / "out", simulator="straight", cameras=["front"])
     assert error.value.where == "cameras"
     assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_simulator_is_named_as_its_argument(tmp_path):
+    with pytest.raises(ArgumentError) as error:
+        simulate(tmp_path / "out", simulator="twon")
+    assert error.value.where == "simulator" and "town" in error.value.expected

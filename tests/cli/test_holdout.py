@@ -34,6 +34,7 @@ def test_held_out_rays_are_printed_below_the_checks(street):
     assert "that the vehicle itself drove through are occupied" in result.output
 
 
+@pytest.mark.slow
 def test_the_grid_that_exists_is_measured_and_ends_in_a_verdict(tmp_path):
     folder = passing_car.write_sequence(tmp_path, frames=8)
     spec = GridSpec.published().with_resolution(0.8)
@@ -45,6 +46,7 @@ def test_the_grid_that_exists_is_measured_and_ends_in_a_verdict(tmp_path):
     assert result.output.endswith("held-out rays: tested and right\n")
 
 
+@pytest.mark.slow
 def test_held_out_rays_are_part_of_the_json(street):
     values = json.loads(run(street, *OPTIONS, "--json").stdout)
     assert values["ok"]
@@ -54,6 +56,7 @@ def test_held_out_rays_are_part_of_the_json(street):
     assert "holdout" not in json.loads(run(street, "--json").stdout)
 
 
+@pytest.mark.slow
 def test_dynamic_changes_what_is_measured(street):
     shares = [
         json.loads(run(street, *OPTIONS, "--json", "--dynamic", dynamic).stdout)["holdout"][

@@ -204,6 +204,7 @@ def test_advice_names_options_where_the_library_names_arguments(tmp_path, captur
     )
 
 
+@pytest.mark.slow
 def test_options_for_scans_and_grids_say_what_observes_the_scene(capture):
     runs = {"capture": [], "scans": ["--stride", 2, "--force"], "grid": ["--from-grid", "capture"]}
     for kind, options in runs.items():

@@ -14,6 +14,7 @@ def call(*options):
     return CliRunner().invoke(app, ["render", *map(str, options)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grid", ["cartesian", "cartesian_fine", "cylindrical"])
 def test_a_picture_of_the_golden_grids(golden_capture, tmp_path, grid):
     result = call(golden_capture / grid, "-o", tmp_path / "a.png", "--size", "640x360")

@@ -45,6 +45,7 @@ def test_the_help_of_a_command_loads_no_numpy(command):
     assert not modules & (COMPILER | STORES | PICTURES | UNUSED_HELP | {"numpy"})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["info", "stats"])
 def test_commands_that_compile_nothing_load_no_compiler(command, data):
     _, modules = loaded(command, data)

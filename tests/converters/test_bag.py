@@ -22,6 +22,7 @@ from helpers.converters.bags import (
     write_bag,
 )
 from helpers.errors import raises
+from helpers.processes.peak import PRINT_PEAK
 
 import carlasc
 from carlasc.converting import Sensor, convert
@@ -321,12 +322,10 @@ def test_memory_does_not_grow_with_the_bag(tmp_path, kind):
         (tmp_path / str(count)).mkdir()
         bag = write_large(tmp_path / str(count), kind, count, 100_000)
         code = (
-            "from pathlib import Path; from carlasc.converting import convert; from "
-            "carlasc.running import Run\n"
+            "from carlasc.converting import convert; from carlasc.running import Run\n"
             f"result = convert('bag', {str(bag)!r}, {str(tmp_path / f'out{count}')!r}, "
             f"grids=None, run=Run(workers=1))\n"
-            f"assert len(result.failures) == 0\n"
-            "print(Path('/proc/self/status').read_text().partition('VmHWM:')[2].split()[0])"
+            f"assert len(result.failures) == 0\n{PRINT_PEAK}"
         )
         run = subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True, check=True

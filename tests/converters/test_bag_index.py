@@ -71,6 +71,7 @@ def check_frames(recording):
         assert cloud.points.tobytes() == DRIVE.scan(frame.number).points.tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "codec"), CODECS)
 def test_compressed_bags_hold_the_same_points(bags, kind, codec):
     (recording,) = Bag(bags[kind, codec]).sequences()
@@ -91,6 +92,7 @@ def test_a_bag_that_is_cut_short_gives_what_is_whole(bags, kind, share, least, t
     assert np.abs(recording.poses().at(recording.times()) - truth)[:least].max() < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "codec"), CODECS)
 @pytest.mark.parametrize("share", [0.3, 0.7, 0.99])
 def test_a_compressed_bag_that_is_cut_short_gives_what_is_whole_or_says_why_not(
@@ -202,6 +204,7 @@ def test_a_chunk_that_does_not_fit_its_checksum_is_named(tmp_path):
         Bag(path).sequences()[0].frames[0].read()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "codec"), [("bag", ""), ("bag", "lz4"), ("db3", ""), ("mcap", ""), ("mcap", "storage")]
 )

@@ -76,6 +76,7 @@ def test_poses_and_times_are_those_of_the_simulation(root: Path) -> None:
     assert found.sensors[0].height_m == pytest.approx(1.73)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1000, 2048])
 def test_grids_of_meshes_are_read_whichever_way_their_labels_are_written(
     tmp_path: Path, factor: int
@@ -288,6 +289,7 @@ class TestContract(ConverterContract):
         write_carlaocc(folder, self.drive, grids={})
 
 
+@pytest.mark.slow
 def test_meshes_are_a_truth_for_the_grids_that_scans_give(tmp_path: Path) -> None:
     drive = SimulatedDrive(frames=3, channels=24, columns=180)
     write_carlaocc(tmp_path / "source", drive)

@@ -129,3 +129,18 @@ def test_a_copy_with_other_times_is_compared_and_kept(tmp_path):
         path.touch()
     again = check(tmp_path / "in", tmp_path / "out")
     assert (again.made, again.skipped) == (0, FRAMES)
+
+
+@pytest.mark.slow
+def test_frames_without_a_record_are_compared_once(tmp_path):
+    folder = write_drive(tmp_path / "in")
+    run(tmp_path / "in", tmp_path / "out")
+    for record in (tmp_path / "out").rglob(".carlasc/conversion.json"):
+        record.unlink()
+    again = check(tmp_path / "in", tmp_path / "out")
+    assert again.made == 0 and any("no record" in note for note in again.notes)
+    for record in (tmp_path / "out").rglob(".carlasc/conversion.json"):
+        record.unlink()
+    shutil.rmtree(tmp_path / "fresh")
+    change_labels(folder)
+    assert check(tmp_path / "in", tmp_path / "out").made > 0

@@ -24,6 +24,7 @@ def kitti(tmp_path):
     return tmp_path / "kitti"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [(1, 2, 3), (3, 1, 2)])
 def test_parts_make_the_files_of_one_conversion(kitti, tmp_path, order):
     how = {"grids": GridOptions(SPEC, follow_ground=False), "poses": PoseOptions(force=True)}

@@ -52,14 +52,13 @@ def test_a_frame_that_fails_is_added_when_it_is_corrected(kitti, tmp_path):
     good = scan.read_bytes()
     scan.write_bytes(good[:-3])
     result = convert("kitti", tmp_path / "kitti", tmp_path / "x.zarr", run=Run(workers=1), **HOW)
-    assert [failure.frame for failure in result.failures] == [17]
+    assert result.failures[0].frame == 17  # others take motion from it, and wait
+    assert all("waits" in failure.message for failure in result.failures[1:])
     (sequence,) = carlasc.open(tmp_path / "x.zarr").sequences().values()
     assert 17 not in sequence.frames("points") and len(sequence.frames("points")) == 19
     scan.write_bytes(good)
-    assert (
-        convert("kitti", tmp_path / "kitti", tmp_path / "x.zarr", run=Run(workers=1), **HOW).made
-        == 1
-    )
+    again = convert("kitti", tmp_path / "kitti", tmp_path / "x.zarr", run=Run(workers=1), **HOW)
+    assert again.failures == () and again.made >= 1
     (sequence,) = carlasc.open(tmp_path / "x.zarr").sequences().values()
     assert len(sequence.frames("points")) == len(sequence.frames("flow")) == 20
 

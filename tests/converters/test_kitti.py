@@ -114,6 +114,7 @@ def test_what_convert_writes_is_valid(converted):
     assert result.sequences[0].voxel_share["evaluation_256x256x32"] > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", ["mirrored", "camera", "transposed"])
 def test_validate_points_out_a_faulty_copy(simulated, converted, tmp_path, fault):
     result = convert("kitti", simulated[0], tmp_path / "out", **PLAIN)

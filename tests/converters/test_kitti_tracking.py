@@ -277,6 +277,7 @@ def corners_in(camera, sensor_T_box, size):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("images", ["none", "link", "copy"])
 def test_cameras_are_those_of_the_projections(copy, tmp_path, images):
     from PIL import Image

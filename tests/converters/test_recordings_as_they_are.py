@@ -545,3 +545,18 @@ def test_scans_without_labels_among_others_are_unlabelled(tmp_path, beside):
         (recording,) = Scans(tmp_path / "s", source_classes="semantickitti", **options).sequences()
         with raises(MissingDataError, where="labels", found="none for any scan"):
             recording.frames  # noqa: B018
+
+
+def test_names_give_the_times_of_scans_whose_points_have_another_clock_than_the_poses(tmp_path):
+    poses = np.zeros((9, 8))
+    poses[:, 0], poses[:, 1], poses[:, 7] = 1.7e9 + 0.05 * np.arange(9), np.arange(9), 1.0
+    (tmp_path / "scans").mkdir()
+    for row in range(0, 9, 2):  # every other pose has a scan
+        seconds = poses[row, 0] - 1.7e9 + POWER_ON_S + SECONDS
+        table = np.zeros(COUNT, [*((name, "<f4") for name in "xyz"), ("time", "<f8")])
+        table["x"], table["time"] = 5.0, seconds * 1e3
+        np.save(tmp_path / "scans" / f"{poses[row, 0]:.6f}.npy", table)
+    np.savetxt(tmp_path / "poses.txt", poses, fmt="%.6f")
+    (recording,) = Scans(tmp_path / "scans", pose_file=str(tmp_path / "poses.txt")).sequences()
+    assert any("the names of the files" in note for note in recording.notes())
+    np.testing.assert_allclose(recording.times(), 0.1 * np.arange(5), atol=1e-6)

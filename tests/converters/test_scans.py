@@ -283,6 +283,7 @@ def test_the_folder_and_the_poses_of_any_format_give_the_same_grids_byte_for_byt
     assert grids[0] == grids[1]
 
 
+@pytest.mark.slow
 @pytest.mark.needs("rosbags")
 def test_the_folder_and_the_bag_give_the_same_grids_byte_for_byte(tmp_path):
     store, spec = bags.Messages("mcap"), GridSpec.published().with_size((32, 32, 4))

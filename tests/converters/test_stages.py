@@ -127,6 +127,7 @@ def test_two_workers_write_the_same_bytes(tmp_path):
         assert (tmp_path / "one" / path).read_bytes() == (tmp_path / "two" / path).read_bytes()
 
 
+@pytest.mark.slow
 def test_what_is_kept_of_a_drive_with_boxes_are_the_boxes_and_not_the_scans(tmp_path):
     def peak(frames):
         class Long(Boxed):

@@ -309,6 +309,7 @@ class TestStatefulDataLoader:
 
         return build
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("workers", [0, 1, 2])
     @pytest.mark.parametrize("steps", [1, 7, 12])
     def test_an_epoch_goes_on_where_its_state_was_saved(self, loader, workers, steps):

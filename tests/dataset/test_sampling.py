@@ -249,6 +249,7 @@ def test_a_part_is_a_slice():
         ShardSampler(SimpleNamespace(dataset=dataset, indices=[0]))
 
 
+@pytest.mark.slow
 @settings(max_examples=10)
 @given(st.integers(1, 4))
 def test_a_sampler_of_a_real_data_set_can_be_pickled_in_the_middle(tmp_path_factory, history):

@@ -91,6 +91,7 @@ def test_the_layers_of_height_are_not_mixed_up():
     assert (network(torch.zeros(2, 1, 8, 8, 4)).argmax(-1) == target).float().mean() > 0.9
 
 
+@pytest.mark.slow
 def test_it_learns_and_a_resumed_run_ends_with_the_weights_of_one_that_was_never_stopped(
     data, tmp_path
 ):
@@ -181,6 +182,7 @@ def test_weights_for_another_history_or_grid_and_grids_that_do_not_divide_are_re
         build_network("baseline", 11, SPEC.with_size((12, 16, 8)))
 
 
+@pytest.mark.slow
 def test_what_it_takes_is_measured_like_other_networks():
     sample = Seen().example(SPEC, 3, np.random.default_rng(0))
     assert set(np.unique(sample["visibility"])) == {0, PASSED, HIT}

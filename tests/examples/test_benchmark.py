@@ -292,6 +292,7 @@ def test_a_study_that_was_stopped_has_equally_many_seeds_of_each_row():
     )
 
 
+@pytest.mark.slow
 def test_the_page_has_the_tables_of_the_results_that_are_kept():
     kept = read(benchmark_page.KEPT)
     page = benchmark_page.PAGE.read_text()

@@ -96,6 +96,7 @@ def test_a_resumed_run_ends_with_the_weights_of_one_that_was_never_stopped(data,
         assert torch.equal(value, found[name]), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("store", ["files", "zarr"])
 @pytest.mark.parametrize("workers", [0, 2])
 def test_a_run_that_is_stopped_in_the_middle_of_an_epoch_ends_with_the_same_weights(
@@ -385,6 +386,7 @@ def certain(tmp_path_factory):
     return root
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "network, free_ratio",
     [("lmscnet_ss", 0.0), ("lmscnet", 0.0), ("sscnet", 2.0), ("js3cnet", 0.0)],

@@ -23,6 +23,7 @@ def scenes(tmp_path):
     return tmp_path / "in"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["kitti", "occ3d", "sscbench", "opensceneflow"])
 @pytest.mark.parametrize("order", [(1, 2, 3), (3, 2, 1)])
 def test_parts_make_the_files_of_one_export(scenes, tmp_path, name, order):

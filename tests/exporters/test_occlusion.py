@@ -73,6 +73,7 @@ def test_every_voxel_is_that_of_the_walk_from_its_centre(grid):
     assert np.array_equal(occluded_voxels(occupied, spec), plain_walk(occupied, spec))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor_z", [-20.0, 0.5, 32.0, 63.9, 64.0, 70.3, 140.0, 200.0])
 def test_columns_may_have_more_voxels_than_an_integer_has_bits(sensor_z):
     spec = GridSpec("cartesian", (4, 3, 150), (-1.3, -1.0, -sensor_z), (2.7, 2.0, 150 - sensor_z))

@@ -71,6 +71,7 @@ def test_boxes_become_flow_in_the_frame_of_the_next_scan(tmp_path):
             assert group["flow_is_valid"][()].mean() > 0.95
 
 
+@pytest.mark.slow
 def test_classes_of_a_converter_go_by_way_of_those_of_carlasc(installed, tmp_path):
     (tmp_path / "in").mkdir()
     convert(
@@ -92,6 +93,7 @@ def test_classes_of_a_converter_go_by_way_of_those_of_carlasc(installed, tmp_pat
     assert 19 in found and found <= {0, 17, 19}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", converter_names())
 def test_every_converter_of_ours_has_classes_that_can_be_exported(name):
     converter = load_converter(name)
@@ -103,6 +105,7 @@ def test_every_converter_of_ours_has_classes_that_can_be_exported(name):
     assert set(labels.tolist()) <= set(TO_OCC3D["carla"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "classes"),
     [

@@ -15,6 +15,7 @@ from carlasc.groundtruth.maps.growing_cells import (
     rows_of_scan,
     split,
 )
+from carlasc.storage.files import temporary_folder
 
 CELL_M = 0.05
 
@@ -97,5 +98,7 @@ def test_a_full_disk_is_named_with_the_file(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")  # as NumPy raises it: without a name
 
     monkeypatch.setattr(np, "save", full)
-    with raises(StorageError, where=str(tmp_path / "a")):
-        filled(tmp_path / "a", scans(2), 10**9)
+    out = tmp_path / "map.ply"
+    with raises(StorageError, where=str(out)), temporary_folder(out) as folder:
+        filled(folder / "cells", scans(2), 10**9)
+    assert not list(tmp_path.iterdir())

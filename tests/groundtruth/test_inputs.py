@@ -8,16 +8,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.datasets.captures import write_capture
+from helpers.datasets.tiny_kitti import write_tiny_kitti
+from helpers.errors import raises
 from helpers.scenes.passing_car import write_sequence
 
 import carlasc
-from carlasc import FromGrid, FromScans, GridSpec, Run, regrid
+from carlasc import FromGrid, FromScans, GridSpec, Run, Voting, regrid
+from carlasc.converting import convert, export
+from carlasc.core import CameraModel
+from carlasc.errors import ArgumentError
 from carlasc.motion import PoseOptions
-from carlasc.running import Part
+from carlasc.running import Part, open_cluster
+from carlasc.storage import layout
+from carlasc.storage.camera_files import cameras_to_json
 
 SPEC = GridSpec("cartesian", (32, 32, 8), (-12.8, -12.8, -2.0), (12.8, 12.8, 1.2))
 FRAMES = 9
 ALONE = Run(workers=1)
+FORCED = PoseOptions(force=True)
 STILL = FromScans(window=(-2, 2), dynamic="tube", poses=PoseOptions("file", "never"))
 
 
@@ -26,7 +34,7 @@ def outputs(folder: Path) -> dict[str, bytes]:
     return {
         path.relative_to(folder).as_posix(): path.read_bytes()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and ".carlasc" not in path.parts
+        if path.is_file() and ".carlasc" not in path.parts and "-1-of-1.json" not in path.name
     }
 
 
@@ -162,6 +170,42 @@ def test_a_copy_with_other_times_is_not_stale(made, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_report_follows_the_text_files(made, tmp_path):
+    fresh = tmp_path / "fresh"
+    (scans(made) / "times.txt").unlink()
+    shutil.copytree(made, fresh, ignore=shutil.ignore_patterns("evaluation*", ".carlasc"))
+    regrid(made, SPEC, observe=STILL, run=ALONE)
+    regrid(fresh, SPEC, observe=STILL, run=ALONE)
+    assert outputs(made) == outputs(fresh)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", ["", ".zarr"])
+def test_files_that_the_input_lost_are_removed_from_a_copy(drive, tmp_path, ending):
+    source, out = copy(drive, tmp_path / "data"), tmp_path / f"out{ending}"
+    camera = CameraModel(
+        name="front",
+        width=64,
+        height=32,
+        matrix=np.diag([40.0, 40.0, 1.0]),
+        sensor_T_camera=np.eye(4),
+    )
+    (scans(source) / "cameras.json").write_bytes(cameras_to_json([camera]))
+    picture = layout.field_named("bev").file(3)
+    (scans(source) / picture).parent.mkdir()
+    (scans(source) / picture).write_bytes(b"a picture")
+    regrid(source, SPEC, out, observe=STILL, run=ALONE)
+    for name in ("times.txt", "cameras.json", picture):
+        (scans(source) / name).unlink()
+    regrid(source, SPEC, out, observe=STILL, run=ALONE)
+    regrid(source, SPEC, tmp_path / "fresh", observe=STILL, run=ALONE)
+    if ending:
+        carlasc.unpack(out, tmp_path / "unpacked", run=ALONE)
+        out = tmp_path / "unpacked"
+    assert outputs(out) == outputs(tmp_path / "fresh")
+
+
+@pytest.mark.slow
 def test_content_is_compared_if_asked(made):
     path = scans(made) / "labels/000003.label"
     about = path.stat()
@@ -193,6 +237,54 @@ def test_grids_without_a_record_are_compared_once(made):
             np.full((scans(made) / f"labels/{number:06d}.label").stat().st_size // 4, 2, "<u4")
         )
     assert regrid(made, SPEC, observe=STILL, run=ALONE).made == FRAMES
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["scans", "actors", "capture", "grid"])
+def test_validate_records_the_inputs_of_grids_without_a_record(made, tmp_path, kind):
+    source, options = made, {"observe": STILL}
+    if kind == "capture":
+        source, options = tmp_path / "town", {}
+        write_capture(source, frames=4)
+    elif kind == "grid":
+        options = {"observe": FromGrid()}
+    elif kind == "actors":
+        aligned = FromScans(window=(-2, 2), poses=PoseOptions("file", "never"))
+        options = {"observe": aligned, "voting": Voting(keep_actors=True), "name": "with_actors"}
+    spec = SPEC.with_size((16, 16, 4)) if kind == "grid" else SPEC
+    regrid(source, spec, run=ALONE, **options)
+    expected = {path: path.read_bytes() for path in source.rglob(".carlasc/made-*.json")}
+    for path in expected:
+        path.unlink()
+    found = [one.found for one in carlasc.validate(source, record=True).findings]
+    assert sum("count as made" in text for text in found) == len(expected)
+    again = regrid(source, spec, run=ALONE, **options)
+    assert again.made == 0 and not any("record" in note for note in again.notes)
+    (record,) = source.rglob(f".carlasc/made-{Path(again.grids[0]).name}.json")
+    assert record.read_bytes() == expected[record]
+    found = [one.found for one in carlasc.validate(source, record=True).findings]
+    assert not any("count as made" in text for text in found)
+
+
+@pytest.mark.slow
+def test_what_changes_after_it_was_recorded_is_made_again(made, tmp_path):
+    for path in made.rglob(".carlasc/made-*.json"):
+        path.unlink()
+    carlasc.validate(made, record=True)
+    change_labels(made, np.random.default_rng(1))
+    (grid,) = carlasc.info(made).sequences[0].grids
+    assert grid.stale.startswith("scan")
+    assert regrid(made, SPEC, observe=STILL, run=ALONE).made == FRAMES
+    fresh = tmp_path / "fresh"
+    shutil.copytree(made, fresh, ignore=shutil.ignore_patterns("evaluation*", ".carlasc"))
+    regrid(fresh, SPEC, observe=STILL, run=ALONE)
+    assert outputs(made) == outputs(fresh)
+
+
+def test_only_folders_keep_records(made, tmp_path):
+    carlasc.pack(made, tmp_path / "data.zarr", run=ALONE)
+    with raises(ArgumentError, where="record", expected="a folder"):
+        carlasc.validate(tmp_path / "data.zarr", record=True)
 
 
 @pytest.mark.slow
@@ -244,6 +336,56 @@ def test_a_changed_recording_of_a_capture(tmp_path, sensor):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("source", "change"),
+    [
+        ("file", move_pose),
+        ("file", delay),
+        *(
+            pytest.param("kiss-icp", change, marks=pytest.mark.needs("kiss_icp"))
+            for change in (change_points, shorten, delay)
+        ),
+    ],
+)
+def test_poses_elsewhere_follow(drive, tmp_path, change, source):
+    given, out = copy(drive, tmp_path / "data"), tmp_path / "out"
+    observe = FromScans(window=(-2, 2), dynamic="tube", poses=PoseOptions(source, "never"))
+    if source == "kiss-icp":
+        (scans(given) / "poses.txt").unlink()
+    regrid(given, SPEC, out, observe=observe, run=ALONE)
+    change(given, np.random.default_rng(0))
+    again = regrid(given, SPEC, out, observe=observe, run=ALONE)
+    assert again.made and not again.failures
+    assert regrid(given, SPEC, out, observe=observe, run=ALONE).made == 0
+    regrid(given, SPEC, tmp_path / "fresh", observe=observe, run=ALONE)
+    assert outputs(out) == outputs(tmp_path / "fresh")
+
+
+def test_a_capture_without_its_last_frame(tmp_path):
+    write_capture(tmp_path / "data", frames=2)
+    regrid(tmp_path / "data", SPEC, tmp_path / "out", run=ALONE)
+    for path in (tmp_path / "data/raw").glob("*/101.npy"):
+        path.unlink()
+    regrid(tmp_path / "data", SPEC, tmp_path / "out", run=ALONE)
+    regrid(tmp_path / "data", SPEC, tmp_path / "fresh", run=ALONE)
+    assert outputs(tmp_path / "out") == outputs(tmp_path / "fresh")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("frame", [100, 102])
+def test_a_changed_pose_of_a_capture(tmp_path, frame):
+    write_capture(tmp_path / "data", frames=4)
+    regrid(tmp_path / "data", SPEC, tmp_path / "out", run=ALONE)
+    path = tmp_path / f"data/raw/pose0/{frame}.npy"
+    pose = np.load(path)
+    pose[0, 3] += 0.1
+    np.save(path, pose)
+    assert regrid(tmp_path / "data", SPEC, tmp_path / "out", run=ALONE).made
+    regrid(tmp_path / "data", SPEC, tmp_path / "fresh", run=ALONE)
+    assert outputs(tmp_path / "out") == outputs(tmp_path / "fresh")
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 @pytest.mark.parametrize("ending", ["zarr", "h5", "parquet"])
 def test_grids_in_a_folder_of_scans_in_a_store(drive, tmp_path, ending, workers):
@@ -261,11 +403,12 @@ def test_grids_in_a_folder_of_scans_in_a_store(drive, tmp_path, ending, workers)
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("change", [change_points, remove, grow])
 @pytest.mark.parametrize("workers", [1, 2])
-def test_grids_in_a_zarr_store(drive, tmp_path, workers):
+def test_grids_in_a_zarr_store(drive, tmp_path, workers, change):
     source, run = copy(drive, tmp_path / "data"), Run(workers)
     regrid(source, SPEC, tmp_path / "out.zarr", observe=STILL, run=run)
-    change_points(source, np.random.default_rng(0))
+    change(source, np.random.default_rng(0))
     again = regrid(source, SPEC, tmp_path / "out.zarr", observe=STILL, run=run)
     assert 0 < again.made < FRAMES
     carlasc.unpack(tmp_path / "out.zarr", tmp_path / "out", run=ALONE)
@@ -284,6 +427,61 @@ def test_parts_make_what_changed_again(drive, tmp_path):
     assert 0 < sum(one.made for one in again) < FRAMES
     regrid(source, SPEC, tmp_path / "fresh", observe=STILL, run=ALONE)
     assert outputs(out) == outputs(tmp_path / "fresh")
+
+
+@pytest.mark.slow
+@pytest.mark.needs("distributed")
+def test_what_changed_is_made_again_on_a_cluster(drive, made, tmp_path):
+    """Scans, a capture, a finer grid, an export, and another data set."""
+    with open_cluster("local:2") as cluster:
+        run = Run(executor=cluster)
+
+        def check(command, change, *out: Path) -> None:
+            command(out[0], run)
+            change()
+            command(out[0], run)
+            command(out[1], ALONE)
+            assert outputs(out[0]) == outputs(out[1])
+
+        def grids(source, **options):
+            return lambda out, run: regrid(source, SPEC, out, run=run, **options)
+
+        def pair(name: str) -> tuple[Path, Path]:
+            return tmp_path / name, tmp_path / f"{name}-fresh"
+
+        given = copy(drive, tmp_path / "given")
+        rng = np.random.default_rng(0)
+        check(grids(given, observe=STILL), lambda: change_points(given, rng), *pair("scans"))
+        aligned = FromScans(window=(-2, 2), poses=PoseOptions("file", "always"))
+        check(grids(given, observe=aligned), lambda: change_labels(given, rng), *pair("aligned"))
+
+        write_capture(tmp_path / "town", frames=4)
+        labels = tmp_path / "town/raw/labels1/102.npy"
+        recolour = lambda: np.save(labels, np.full_like(np.load(labels), 3))  # noqa: E731
+        check(grids(tmp_path / "town"), recolour, *pair("capture"))
+
+        (grid,) = scans(made).glob("evaluation*/000003.label")
+        coarse = SPEC.with_size((16, 16, 4))
+        check(
+            lambda out, run: regrid(made, coarse, out, observe=FromGrid(), run=run),
+            lambda: grid.write_bytes(bytes(grid.stat().st_size)),
+            *pair("coarse"),
+        )
+        check(
+            lambda out, run: export("kitti", made, out, run=run),
+            lambda: change_points(made, rng),
+            *pair("exported"),
+        )
+
+        folder = write_tiny_kitti(tmp_path / "kitti", frames=3, points=400)
+        path = folder / "labels/000001.label"
+        check(
+            lambda out, run: convert(
+                "kitti", tmp_path / "kitti", out, grids=None, poses=FORCED, run=run
+            ),
+            lambda: path.write_bytes(np.roll(np.fromfile(path, "<u4"), 7).tobytes()),
+            *pair("converted"),
+        )
 
 
 @pytest.mark.slow

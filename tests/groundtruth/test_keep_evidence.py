@@ -121,6 +121,7 @@ def test_voxels_that_are_not_certain_enough_become_unknown(drive):
     assert not any("occupied" in name for name in sequence.fields())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [{"keep_evidence": True}, {"min_confidence": 0.8}])
 def test_a_frame_that_cannot_say_how_certain_it_is_fails(drive, monkeypatch, settings):
     make = ScanFrame.make

@@ -7,12 +7,13 @@ import json
 import numpy as np
 import pytest
 from carlasc_converters.point_files import read_columns
+from helpers.errors import raises
 from helpers.scenes.passing_car import CAR, SPEED_M_S, scan, sensor_pose, write_sequence
 from numpy.testing import assert_allclose, assert_array_equal
 
 import carlasc
 from carlasc import GridSpec, MapExtras, Run
-from carlasc.core.geometry import relative_to, transform_points
+from carlasc.core.geometry import mirror_poses, quaternions_of, relative_to, transform_points
 from carlasc.core.grids import mirror_voxels
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
@@ -46,7 +47,9 @@ def drive(tmp_path_factory):
 
 def make(drive, out, **options):
     given = {"motion": NONE, "poses": GIVEN, "run": ALONE, "cell_m": 0.1} | options
-    extras = MapExtras(**{k: given.pop(k) for k in ("actors", "mesh", "distance") if k in given})
+    extras = MapExtras(
+        **{k: given.pop(k) for k in ("actors", "mesh", "distance", "trajectory") if k in given}
+    )
     return carlasc.map(drive, out, extras=extras, **given)
 
 
@@ -104,6 +107,18 @@ def test_a_map_is_what_plain_python_makes(drive, tmp_path):
         atol=1e-4,
     )
     assert dict(made["classes"].tolist())[1] == CARLA.names[1]
+
+
+def test_the_trajectory_is_that_of_the_drive_in_the_format_of_tum(drive, tmp_path):
+    make(drive, tmp_path / "map.ply", frames="2:5", trajectory=tmp_path / "poses.tum")
+    table = np.loadtxt(tmp_path / "poses.tum")
+    for row, frame in zip(table, range(2, 5), strict=True):
+        pose = relative_to(sensor_pose(0), sensor_pose(frame)[None])[0]
+        pose = mirror_poses(pose[None])[0]  # the drive has y to the right
+        assert_allclose(row[:4], [0.1 * frame, *pose[:3, 3]], atol=1e-5)
+        assert_allclose(row[[7, 4, 5, 6]], quaternions_of(pose[None, :3, :3])[0], atol=1e-5)
+    with raises(ArgumentError, where="trajectory"):
+        make(drive, tmp_path / "g.ply", grid=GRID, trajectory=tmp_path / "other.tum")
 
 
 def test_what_moves_leaves_no_trace_and_what_stands_stays(drive, tmp_path):

@@ -172,12 +172,14 @@ class TestPass:
         assert len(passes) == 1
         assert kept_in(street).read_bytes() == kept
 
+    @pytest.mark.slow
     def test_kept_actors_give_the_same_grids_as_new_ones(self, street, passes):
         first, again = run(street, "first", (4, 6)), run(street, "again", (4, 6))
         kept_in(street).unlink()
         assert first == again == run(street, "new", (4, 6))
         assert len(passes) == 2
 
+    @pytest.mark.slow
     def test_it_is_made_again_after_a_scan_was_replaced(self, street, passes):
         run(street, "before", (4, 6))
         path = street / "cartesian" / layout.field_named("points").file(5)
@@ -188,6 +190,7 @@ class TestPass:
         run(street, "after", (4, 6))
         assert len(passes) == 2
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         "data", [b"", b"not an archive", MovingActors().to_bytes("of another drive")]
     )
@@ -200,6 +203,7 @@ class TestPass:
         assert len(passes) == 2
         assert MovingActors.from_bytes(kept_in(street).read_bytes(), "tracks")[0].tracks
 
+    @pytest.mark.slow
     def test_other_options_of_motion_need_another_one(self, street, passes):
         run(street, "fields", (4, 5))
         run(street, "evidence", (4, 5), motion=MotionOptions("evidence"))
@@ -222,6 +226,7 @@ class TestPass:
     def test_a_grid_does_not_depend_on_the_frames_of_the_run(self, street):
         assert run(street, "alone", (5, 6))["000005.label"] == run(street, "all")["000005.label"]
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("options", "scans"),
         [

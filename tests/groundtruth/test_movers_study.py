@@ -173,6 +173,7 @@ def small(monkeypatch, tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_a_drive_is_recorded_once_with_exact_boxes(small):
     import movers_drives
     from movers_drives import record
@@ -194,6 +195,7 @@ def test_a_drive_is_recorded_once_with_exact_boxes(small):
     assert max(sides.values()) >= 2 and all(0 <= count <= 3 for count in sides.values())
 
 
+@pytest.mark.slow
 def test_rows_change_what_they_say(small):
     from movers_drives import record
     from movers_rows import NoisyPoses, noisy_boxes, without_movers, wrong_ids

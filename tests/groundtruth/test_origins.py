@@ -127,6 +127,7 @@ def test_origins_are_sorted_into_runs_and_keep_the_order_of_points():
     assert len(sorted_by_origin(np.empty((0, 3), np.float32))) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rolling", [False, True])
 def test_a_lidar_that_turns_on_a_fast_vehicle_leaves_as_much_free_space_wrong_as_one_that_does_not(
     rolling, tmp_path

@@ -172,6 +172,7 @@ def test_what_was_given_stays_and_the_record_says_how_poses_were_used(folder, wr
     )
 
 
+@pytest.mark.slow
 def test_refined_poses_are_kept_and_used_again(folder, passes):
     make(folder)
     kept = kept_in(folder).read_bytes()
@@ -187,6 +188,7 @@ def test_refined_poses_are_kept_and_used_again(folder, passes):
     assert len(passes) == 3 and kept_in(folder).read_bytes() == kept
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("data", [b"", b"not an archive"])
 def test_what_is_kept_and_damaged_is_made_again(folder, passes, data):
     make(folder)
@@ -243,6 +245,7 @@ def test_scans_far_apart_keep_their_poses(drive, tmp_path):
     assert (result.made, result.failures) == (6, ())
 
 
+@pytest.mark.slow
 def test_frames_without_a_scan_get_the_correction_of_the_one_before(drive, wrong, tmp_path):
     scans, true = drive
     folder = write((scans, wrong), tmp_path / "gap", wrong)

@@ -141,6 +141,7 @@ def test_a_run_that_is_continued_leaves_the_report_of_one_run(street, made, tmp_
     assert report.read_bytes() == whole
 
 
+@pytest.mark.slow
 def test_parts_of_a_sequence_add_up_in_the_report(street, made, tmp_path):
     make(street, tmp_path, frames=(0, 3))
     assert report_in(tmp_path).frames == (0, 1, 2)
@@ -196,6 +197,7 @@ def test_captures_and_finer_grids_have_reports_too(tmp_path):
     assert report_in(tmp_path).coverage.voxels == 3 * SPEC.num_voxels
 
 
+@pytest.mark.slow
 def test_the_report_is_the_same_in_a_store(street, made, tmp_path):
     pytest.importorskip("h5py")
     from carlasc.storage.hdf5.hdf5_sink import HDF5Sink

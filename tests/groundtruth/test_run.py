@@ -294,6 +294,7 @@ class MemoryWriter(SequenceWriter):
         self.closed += 1
 
 
+@pytest.mark.slow
 def test_a_store_with_one_writer_gets_its_frames_in_order_from_the_workers(tmp_path):
     write_capture(tmp_path, frames=6)
     sink = MemorySink()

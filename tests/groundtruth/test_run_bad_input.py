@@ -69,6 +69,7 @@ BAD = {  # the file of frame 101, what is done to it, what the message says
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bad", BAD)
 def test_a_bad_frame_is_named_the_others_are_made_and_a_fixed_one_is_added(tmp_path, bad):
     folder, spoil, message = BAD[bad]

@@ -96,6 +96,7 @@ def test_correct_poses_raise_no_alarm(speed, rolling):
     assert (result.correction, result.offset_m) == (None, None)
 
 
+@pytest.mark.slow
 def test_vehicles_that_keep_pace_are_not_taken_for_scans_in_one_frame():
     rng = np.random.default_rng(3)
     fixed, convoy = (

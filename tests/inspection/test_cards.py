@@ -184,6 +184,7 @@ def test_checksums_are_those_of_the_files(tables: Path) -> None:
         )
 
 
+@pytest.mark.slow
 @pytest.mark.needs("datasets", "pyarrow")
 def test_load_dataset_opens_the_store_as_it_is_and_the_readme_shows_how(
     tables: Path, tmp_path: Path
@@ -261,6 +262,7 @@ def test_sequences_with_other_columns_and_several_splits_are_opened(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["folder", "zip", "zarr", "h5"])
 def test_other_stores_are_valid_and_say_how_they_are_opened(
     kind: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
@@ -385,6 +387,7 @@ def test_a_set_that_forbids_passing_on_is_refused_with_the_reason(
     assert not (root / "README.md").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("license_", ["ask the authors", 4, ["CC BY 4.0"], "CC BY-NC-SA"])
 def test_a_licence_in_the_data_that_nobody_knows_is_one_line(
     tmp_path: Path, license_: object

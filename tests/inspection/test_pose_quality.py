@@ -104,7 +104,7 @@ def test_the_messages_say_what_to_do():
     assert "0.10 ± 0.01 s early" in described(late=-0.1)[0]
     arm, fix_arm = described(x=0.8, y=-0.3, yaw=np.deg2rad(2.0))
     assert (
-        "at about x = 0.80 ± 0.02 m, y = -0.30 ± 0.02 m, z undetermined and poses in whose frame "
-        "the sensor is turned by yaw 2.0 ± 0.1 degrees" in arm
+        "at about x = 0.80 ± 0.02 m, y = -0.30 ± 0.02 m, z = undetermined and poses in whose frame "
+        "the sensor is turned by yaw 2.00 ± 0.06 degrees" in arm
     )
     assert "inv(T) @ P @ T" in fix_arm and "carlasc refine" in fix_arm

@@ -74,6 +74,24 @@ def test_a_motion_that_is_missing_in_the_poses_is_never_sound(name, share, tmp_p
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["stairwell", "room"])
+@pytest.mark.parametrize(
+    "error",
+    [np.linspace(0, 0.3, 20), np.where(np.arange(20) % 2, 0.06, -0.06) * (np.arange(20) > 9)],
+)
+def test_poses_whose_height_drifts_are_never_sound(name, error, tmp_path):
+    scans, poses = film(name)
+    poses[:, 2, 3] += error
+    assert checks_of(write(tmp_path, scans, poses))[1]["poses-on-scans"] == "wrong"
+
+
+@pytest.mark.slow
+def test_few_beams_on_steep_stairs_do_not_determine_the_height(tmp_path):
+    scans, poses = film("stairwell", channels=16, elevation_deg=(-8.0, 8.0))
+    assert checks_of(write(tmp_path, scans, poses))[1]["poses-on-scans"] != "right"
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("beams", [(16, 900), (64, 1024)])
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_no_motion_along_a_tunnel_is_called_tested(beams, share, tmp_path):

@@ -102,6 +102,7 @@ def test_a_sequence_of_grids_alone_is_sound(golden_capture: Path, grid: str) -> 
     assert found(validate(golden_capture / grid), "warning") == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fixture", ["turning", "turning_kitti"])
 def test_a_drive_round_a_bend_is_sound_in_both_frames(
     fixture: str, request: pytest.FixtureRequest
@@ -137,6 +138,7 @@ def test_scans_alone_raise_no_false_alarm(
     assert result.verdict == "sound"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["fine", "cylindrical"])
 @pytest.mark.parametrize("labelled", [True, False])
 def test_other_grids_raise_no_false_alarm(tmp_path: Path, name: str, labelled: bool) -> None:
@@ -273,6 +275,7 @@ def test_scans_that_are_in_one_common_frame_are_told(copy: Path) -> None:
     assert "scans that are all in one frame" in found(validate(copy))["poses-on-scans"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift", [(1, 0, 0), (0, -1, 0), (-1, 1, 0), (0, 0, 1)])
 def test_a_grid_shifted_by_a_cell_is_named_with_its_direction(
     copy: Path, shift: tuple[int, int, int]
@@ -434,6 +437,7 @@ def test_missing_poses_are_an_error_where_there_are_scans(copy: Path) -> None:
     assert "found no file" in found(validate(copy))["poses"]
 
 
+@pytest.mark.slow
 def test_poses_shorter_than_the_scans_are_an_error_and_longer_ones_a_warning(copy: Path) -> None:
     lines = (copy / layout.POSES).read_text().splitlines(keepends=True)
     (copy / layout.POSES).write_text("".join(lines[:-1]))
@@ -475,6 +479,7 @@ def test_a_line_that_is_no_pose_is_named(copy: Path) -> None:
     assert "12 numbers per line, found 3 in line 5" in found(validate(copy))["poses"]
 
 
+@pytest.mark.slow
 def test_times_that_do_not_rise_are_named(copy: Path) -> None:
     times = np.arange(12) * 0.1
     times[4] = 0.1
@@ -503,6 +508,7 @@ def test_a_sequence_without_anything_is_an_error_and_the_others_are_still_checke
     assert [report.frames for report in result.sequences] == [12, 0]
 
 
+@pytest.mark.slow
 def test_the_level_above_a_sequence_is_understood(turning: Path, tmp_path: Path) -> None:
     (tmp_path / "Val" / "A").mkdir(parents=True)
     (tmp_path / "Val" / "A" / "cartesian").symlink_to(turning / "cartesian")
@@ -520,6 +526,7 @@ def test_a_level_too_low_and_an_empty_folder_are_told(turning: Path, tmp_path: P
     assert caught.value.expected.startswith("a data set, a split, a sequence")
 
 
+@pytest.mark.slow
 def test_progress_reaches_its_total_and_a_source_serves_as_well_as_a_path(turning: Path) -> None:
     seen: list[tuple[int, int]] = []
     validate(

@@ -176,6 +176,7 @@ def test_free_may_be_any_class():
     assert matrix.mean_iou(with_free=False) == pytest.approx((4 / 10 + 2 / 4) / 2)
 
 
+@pytest.mark.slow
 def test_metrics_of_arrays_do_not_import_torch():
     code = (
         "import sys, numpy as np; from carlasc.metrics import ConfusionMatrix; a = np.zeros(3, "

@@ -53,6 +53,7 @@ def test_occ3d_is_scored_where_the_lidar_or_a_camera_looked(tmp_path):
         assert result.miou == pytest.approx(np.mean(ious))
 
 
+@pytest.mark.slow
 def test_frames_go_together_by_their_tokens_and_a_missing_one_is_named(tmp_path):
     write_occ3d(tmp_path / "gts", 0)
     write_occ3d(tmp_path / "pred", 0)

@@ -5,6 +5,7 @@ import pytest
 
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics import ConfusionMatrix, compare, confidence_interval, interval_of, jackknife
+from carlasc.metrics.results import FigureTable
 
 
 def matrices(accuracies, seed=0, size=4000):
@@ -111,3 +112,12 @@ def test_only_sequences_that_both_have_are_compared():
     first, second = matrices([0.7] * 7), matrices([0.5] * 7)
     del second["s3"]
     assert compare(first, second, accuracy).sequences == ("s0", "s1", "s2", "s4", "s5", "s6")
+
+
+def test_a_name_is_text_in_markdown_and_latex():
+    name = r"<script>a|b</script>\\input{x}~^"
+    table = FigureTable(name, ("Network", "mIoU"), ((name, 1.0),))
+    row = table.to_markdown().splitlines()[-1]
+    assert row == r"| &lt;script>a\|b&lt;/script>\\input{x}~^ | 1.00 |"
+    escaped = r"\textbackslash{}\textbackslash{}input\{x\}\textasciitilde{}\textasciicircum{}"
+    assert rf"<script>a|b</script>{escaped} & 1.00 \\" in table.to_latex()

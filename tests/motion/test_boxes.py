@@ -289,6 +289,7 @@ def test_in_a_simulated_town_members_are_the_points_of_their_actors(town):
     assert right > 1000 and wrong < 0.01 * right and missed < 0.02 * right
 
 
+@pytest.mark.slow
 def test_in_a_simulated_town_what_is_parked_stands_and_what_drives_moves(town):
     simulated, _, tracks = town
     speeds = {}

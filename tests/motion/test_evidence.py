@@ -57,6 +57,7 @@ def test_errors_of_poses_and_a_moving_sensor_do_not_make_walls_move():
     assert share[CAR] > 0.3  # one of the two
 
 
+@pytest.mark.slow
 def test_a_car_that_starts_is_whole_while_it_stands():
     def starts(seconds):
         return [*WALLS, car(-6.0 + 4.0 * max(seconds - 2.0, 0.0) ** 2, 6.0)]
@@ -64,6 +65,7 @@ def test_a_car_that_starts_is_whole_while_it_stands():
     assert shares(film(starts, 60), last=15)[CAR] > 0.9
 
 
+@pytest.mark.slow
 def test_a_car_that_stops_is_whole_while_it_stands():
     def stops(seconds):
         return [*WALLS, car(8.0 - 4.0 * max(3.5 - seconds, 0.0) ** 2, 6.0)]

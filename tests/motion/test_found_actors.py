@@ -97,6 +97,7 @@ STATIC = {
 """What repeats: the speed of the sensor, m/s, at which most of it seems to move, and the boxes."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STATIC)
 def test_what_repeats_along_the_street_is_no_actor(name):
     speed, boxes = STATIC[name]
@@ -106,6 +107,7 @@ def test_what_repeats_along_the_street_is_no_actor(name):
     assert find_actors(scan for scan, _ in filmed).tracked == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "speed", "y"),
     [((4.4, 1.8, 1.5), 8.0, 3.5), ((1.7, 0.5, 1.6), 5.0, 5.0), ((0.5, 0.5, 1.7), 1.4, -4.0)],

@@ -100,6 +100,7 @@ def step_errors(estimated, true):
     return np.linalg.norm(steps[0][:, :3, 3] - steps[1][:, :3, 3], axis=1)
 
 
+@pytest.mark.slow
 def test_a_drive_may_start_at_any_speed(bend):
     _, scans, true = bend
     estimated = estimate_poses([scan.deskewed[:, :3] for scan in scans], max_range_m=50.0)
@@ -118,6 +119,7 @@ def test_the_sensor_may_be_at_any_height(height_m):
     assert step_errors(estimated, true).max() < 0.06
 
 
+@pytest.mark.slow
 def test_poses_of_rolling_scans_are_those_at_the_times_of_the_frames(bend):
     drive, scans, true = bend
     points, seconds = [scan.points[:, :3] for scan in scans], [scan.seconds for scan in scans]
@@ -181,9 +183,9 @@ def test_seconds_must_be_those_of_the_points():
         assert "200 of scan 1" in error.value.expected and error.value.found == found
 
 
-def scene_errors(name, frames):
+def scene_errors(drive):
     """Return the greatest error of the position as a share of the way, and what was chosen."""
-    drive, said = replace(SCENES[name], frames=frames), []
+    frames, said = drive.frames, []
     scans = [drive.scan(frame) for frame in range(frames)]
     chosen = [usable_points(scan.points) for scan in scans]
     usable = [(s.points[u, :3], s.seconds[u]) for s, u in zip(scans, chosen, strict=True)]
@@ -200,15 +202,44 @@ def scene_errors(name, frames):
         "room",
         *(
             pytest.param(name, marks=pytest.mark.slow)
-            for name in ("walking-robot", "drone", "pitched")
+            for name in ("stairwell", "walking-robot", "drone", "pitched")
         ),
     ],
 )
 def test_carriers_other_than_cars_are_followed_within_two_percent(name):
-    error, said = scene_errors(name, 12 if name == "room" else 40)
+    error, said = scene_errors(replace(SCENES[name], frames=12 if name == "room" else 40))
     assert error < 0.02
     (line,) = said
     assert line.startswith("odometry by planes: points within ")
+
+
+def stairwell(steps, **lidar):
+    """Return the stairwell with steps of another depth and height."""
+    scene = SCENES["stairwell"]
+    scale = np.array([steps[0] / 0.28, 1.0, steps[1] / 0.17])
+
+    def way(at):
+        poses = scene.way(at)
+        poses[..., 2, 3] *= scale[2] / scale[0]
+        return poses
+
+    things = tuple(
+        replace(thing, center=tuple(scale * thing.center), size=tuple(scale * thing.size))
+        for thing in scene.things
+    )
+    return replace(scene, things=things, way=way, **lidar)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("steps", "lidar"),
+    [
+        ((0.31, 0.15), {"channels": 64, "elevation_deg": (-25.0, 15.0)}),
+        ((0.26, 0.18), {"channels": 40, "elevation_deg": (-30.0, 30.0), "columns": 500}),
+    ],
+)
+def test_stairs_of_other_sizes_are_followed_within_two_percent(steps, lidar):
+    assert scene_errors(stairwell(steps, **lidar))[0] < 0.02
 
 
 def test_a_street_needs_no_note():

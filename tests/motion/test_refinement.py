@@ -101,6 +101,7 @@ class TestStreet:
         found = refine(scans, wrong_poses(true, **ROWS["jitter"], seed=2))
         assert np.linalg.norm((found.poses - true)[:, :3, 3], axis=1).max() < 0.3
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("mistake", ["faster", "slower", "shuffled", "another drive"])
     def test_poses_of_another_drive_are_not_made_plausible(self, dense, mistake):
         scans, true = dense

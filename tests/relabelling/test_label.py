@@ -25,6 +25,7 @@ from carlasc.errors import (
     ConflictError,
     FormatError,
     MissingDataError,
+    StorageError,
 )
 from carlasc.inspection import card, report, validate
 from carlasc.storage import open as open_store
@@ -115,6 +116,7 @@ def test_carlasc_json_keeps_what_it_said_and_names_who_predicted(data, predictio
     assert {one.metadata.predicted for one in made.values()} == {"predicted by SPVCNN, 2 epochs"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", [".zarr", ".h5", ".parquet"])
 def test_probabilities_go_through_every_store_and_packed_sources_are_unpacked(
     data, predictions, tmp_path, ending
@@ -225,10 +227,20 @@ def test_what_exists_is_not_replaced_unless_it_was_labelled_and_that_is_asked_fo
             carlasc.label(data, place, tmp_path / "net", overwrite=True, run=ALONE)
 
 
-def test_an_error_says_where_the_replaced_data_set_is(data, predictions, tmp_path):
+def test_an_error_keeps_the_data_set_or_says_where_it_is(data, predictions, tmp_path, monkeypatch):
     carlasc.label(data, tmp_path / "out", tmp_path / "net", run=ALONE)
     (tmp_path / "out.part").mkdir()  # of another run, which lost its mark
-    with pytest.raises(ConflictError) as error:
+    with pytest.raises(ConflictError):
+        carlasc.label(data, tmp_path / "out", tmp_path / "net", overwrite=True, run=ALONE)
+    assert open_store(tmp_path / "out").sequences()[WHOLE].metadata.predicted
+    assert not (tmp_path / "out.replaced").exists()
+    (tmp_path / "out.part").rmdir()
+
+    def full(*_, **__):
+        raise StorageError(tmp_path / "out.part", problem="the disk is full")
+
+    monkeypatch.setattr("carlasc.storage.derived_copies.unpack", full)
+    with pytest.raises(StorageError) as error:
         carlasc.label(data, tmp_path / "out", tmp_path / "net", overwrite=True, run=ALONE)
     assert error.value.advice.endswith(str(tmp_path / "out.replaced"))
     assert open_store(tmp_path / "out.replaced").sequences()[WHOLE].metadata.predicted

@@ -136,6 +136,7 @@ def test_motions_are_nearer_to_the_truth_and_everything_else_is_the_same_file(
     assert not list(tmp_path.glob("out.*"))
 
 
+@pytest.mark.slow
 def test_carlasc_json_says_what_was_done_and_keeps_what_it_said(data, tmp_path):
     carlasc.refine(data, tmp_path / "out", run=ALONE)
     found = [
@@ -174,6 +175,7 @@ def test_exact_poses_stay_the_same_bytes_unless_they_are_always_refined(exact, t
     assert 0 < off_m(poses_of(tmp_path / "always"), truth) < 0.005
 
 
+@pytest.mark.slow
 def test_stacks_of_aligned_scans_agree_better(data, exact, tmp_path):
     carlasc.refine(data, tmp_path / "out", run=ALONE)
 
@@ -243,6 +245,7 @@ def test_too_few_scans_are_left_alone_and_sequences_without_scans_are_left_out(e
     assert error.value.expected == "sequences with points"
 
 
+@pytest.mark.slow
 def test_what_exists_is_not_replaced_unless_it_was_refined_and_that_is_asked_for(data, tmp_path):
     carlasc.refine(data, tmp_path / "out", run=ALONE)
     with pytest.raises(CompleteError):

@@ -21,6 +21,7 @@ ANYWHERE = ("regrid", "cylinders", "coarse", "scans", "export")
 """Steps whose files do not depend on the versions of other packages."""
 
 
+@pytest.mark.slow
 def test_files_are_those_that_every_version_of_python_writes(tmp_path: Path) -> None:
     found = sums.sums_of(tmp_path / "case", only=ANYWHERE)
     assert len(found) > 80

@@ -9,6 +9,7 @@ from faults import changes
 from helpers.processes.fresh import in_fresh_process
 
 
+@pytest.mark.slow
 def test_a_changed_input_is_never_silent(tmp_path: Path) -> None:
     outcome = in_fresh_process(changes.run, 6, 0, tmp_path, ["regrid", "convert"])
     assert outcome.found == []

@@ -19,6 +19,7 @@ QUICK = ("convert", "download-extract")
 """Commands whose data are quickly made."""
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_after_a_power_failure_files_are_whole_or_absent_and_the_next_run_finishes(
     tmp_path: Path,

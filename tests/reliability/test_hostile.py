@@ -12,6 +12,7 @@ from helpers.processes.fresh import in_fresh_process
 pytest.importorskip("h5py")
 
 
+@pytest.mark.slow
 def test_a_slice_of_the_cases_does_no_harm(tmp_path: Path) -> None:
     outcome = in_fresh_process(run, 10, 2, tmp_path)
     assert outcome.found == []

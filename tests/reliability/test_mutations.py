@@ -25,6 +25,7 @@ QUICK = ("folder", "zip", "zarr", "parquet", "capture", "results", "kitti", "nus
 SEED = 7
 
 
+@pytest.mark.slow
 def test_a_few_damaged_files_of_the_common_kinds_are_read_or_refused() -> None:
     available = [
         target.name for target in TARGETS if target.name in QUICK and target.is_available()

@@ -38,6 +38,7 @@ class TestHDF5Sink(SinkContract):
         return carlasc.open(out)
 
 
+@pytest.mark.slow
 def test_h5py_with_hdf5plugin_reads_the_same_numbers_as_the_page_says(
     published: Path, store: Path, tmp_path: Path
 ) -> None:

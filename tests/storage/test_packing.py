@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from helpers.datasets.sequences import files_of, grid, params, write_dataset
 from helpers.errors import raises
+from helpers.processes.peak import PRINT_PEAK
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
@@ -69,6 +70,7 @@ def test_a_zip_is_packed_in_place(data: Path, tmp_path: Path) -> None:
     assert round_trip(archive, tmp_path / "x.zarr") == files_of(data)
 
 
+@pytest.mark.slow
 def test_a_store_is_packed_again_as_another_kind(data: Path, tmp_path: Path) -> None:
     pack(data, tmp_path / "a.h5")
     pack(tmp_path / "a.h5", tmp_path / "b.parquet")
@@ -185,6 +187,7 @@ def test_counts_of_any_size_come_back(tmp_path: Path, kind: str, most: float) ->
     assert round_trip(tmp_path / "data", tmp_path / f"x.{kind}") == files_of(tmp_path / "data")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("largest", [255, 256, 65_536, 2**32 - 1])
 def test_labels_of_any_size_come_back(tmp_path: Path, kind: str, largest: int) -> None:
@@ -266,6 +269,7 @@ def test_the_result_counts_bytes_per_field_and_lists_what_is_left_out(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_existing_store_is_replaced_only_with_overwrite(
     data: Path, tmp_path: Path, kind: str
@@ -292,6 +296,7 @@ def test_an_existing_folder_is_unpacked_into_only_with_overwrite(
     assert files_of(tmp_path / "files") == files_of(data / "Val") | {"mine.txt": b"mine"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("out", ["x.zarr", "Train/x.zarr", ".", ".."])
 def test_an_output_inside_or_around_the_source_is_refused(tmp_path: Path, out: str) -> None:
     data = write_dataset(tmp_path / "data")
@@ -333,6 +338,7 @@ def test_an_output_that_cannot_be_written_is_one_clear_error(
         pack(data / "Val", tmp_path / "file" / f"x.{kind}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ["../evil", "/tmp/evil", "Train/../../evil"])
 def test_a_store_whose_names_lead_elsewhere_is_not_unpacked(
     data: Path, tmp_path: Path, path: str
@@ -413,8 +419,10 @@ def test_a_killed_unpack_continues_file_by_file(data: Path, tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_the_memory_does_not_grow_with_the_sequence(tmp_path: Path) -> None:
-    script = "import resource, sys; from carlasc.storage.packing import pack; pack(sys.argv[1], sys.argv[2]);"
-    script += "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+    script = (
+        "import sys; from carlasc.storage.packing import pack; pack(sys.argv[1], sys.argv[2])\n"
+    )
+    script += PRINT_PEAK
     points = np.zeros((100_000, 4), np.float32)
     points[:, :3] = np.random.default_rng(0).normal(size=(100_000, 1))
     peaks = []

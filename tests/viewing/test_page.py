@@ -120,6 +120,7 @@ def test_what_cannot_be_written_is_refused(blocks, tmp_path):
         view(blocks, tmp_path / "a.html")
 
 
+@pytest.mark.slow
 def test_sixty_dense_frames_stay_under_fifteen_megabytes(tmp_path):
     """A frame as full as a real one: 130,000 points, a coarse grid of 20,000 voxels; its bytes
     times 60.

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.processes.peak import PRINT_PEAK
 from helpers.readers.pixels import BLUE, RED
 from helpers.readers.recorded import (
     POINT,
@@ -593,12 +594,11 @@ def test_points_have_the_numbers_of_their_actors(tmp_path):
     np.testing.assert_array_equal(found["instance"], numbers)
 
 
-LONG = """
-import resource, sys
+LONG = f"""
+import sys
 from carlasc.viewing import Scene, view
 view(Scene(sys.argv[1], frames=(0, int(sys.argv[3]))), sys.argv[2], overwrite=True)
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-"""
+{PRINT_PEAK}"""
 
 
 @pytest.mark.slow

@@ -34,7 +34,6 @@ from carlasc.groundtruth.inputs import (
     SequenceInput,
     StoredSequence,
     choose_frames,
-    parent_path,
     scan_fields,
     stored_views,
 )
@@ -368,7 +367,7 @@ class ScanSequence(StoredSequence):
         if self.actors.own:
             notes.append(
                 f"{where}: points near the sensor move with it: they are on the recording vehicle, "
-                f"and were left out"
+                "or on a person who walks beside it at exactly its pace, and were left out"
             )
         wrong = sum(max(actor["size_m"]) >= LONGEST_M for actor in self.actors.summary)
         if wrong:
@@ -412,7 +411,7 @@ def scan_sequences(
     """
     sequences: dict[str, Sequence] = {}
     for sequence in as_source(source).sequences().values():
-        parent = parent_path(sequence)
+        parent = layout.place_of(sequence.path)
         # scans may exist beside the grids of both coordinates: take the folder with more
         other = sequences.get(parent)
         if other is None or len(sequence.frames("points")) > len(other.frames("points")):

@@ -16,7 +16,6 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, IntArray, LabelArray
 from carlasc.groundtruth.maps.cloud_files import POINT_DTYPE
-from carlasc.storage.files import writing
 
 Part = tuple[int, int, int]
 """Cells that are kept together: a group (`STATIC`, or the number of an actor), and x and y of a
@@ -158,14 +157,8 @@ class GrowingCells:
                 self._stored.add(part)
 
     def _save(self, part: Part, rows: AnyArray) -> None:
-        """Write the rows of a part.
-
-        Raises:
-            StorageError: the file cannot be written.
-        """
-        path = self._path(part)
-        with writing(path):
-            np.save(path, rows)
+        """Write the rows of a part."""
+        np.save(self._path(part), rows)
 
     def _path(self, part: Part) -> Path:
         return self.folder / f"{'_'.join(map(str, part))}.npy"

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import io
-import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -21,7 +20,7 @@ from carlasc.groundtruth.maps.cloud_files import (
     write_octomap,
     write_points,
 )
-from carlasc.storage.files import AnyPath, write_output, writing
+from carlasc.storage.files import AnyPath, write_output
 
 OCTOMAP = ".bt"
 ACTORS = "actors.json"
@@ -75,30 +74,30 @@ class MapCells:
 
 @dataclass(frozen=True)
 class MapFiles:
-    """The paths of a map: points or tree, mesh, distances, and the folder of actors; None: not
-    written.
+    """The paths of a map: points or tree, mesh, distances, trajectory, and the folder of actors;
+    None: not written. `begin` is called before the first file is written.
     """
 
     out: Path | None
     mesh: Path | None
     distance: Path | None
+    trajectory: Path | None
     actors: Path | None
+    begin: Callable[[], None] = lambda: None
 
     @classmethod
-    def of(cls, out: Any, mesh: Any, distance: Any, actors: bool, grid: str | None) -> Self:
-        """Return the paths of a map.
+    def of(cls, given: Mapping[str, Any], actors: bool, grid: str | None) -> Self:
+        """Return the paths of a map; `given` has the files by name.
 
         Raises:
             ArgumentError: an ending is not known, or a file cannot be made from this map.
         """
-        endings = {"out": (*POINT_ENDINGS, OCTOMAP), "mesh": MESH_ENDINGS, "distance": (".npz",)}
-        given = {"out": out, "mesh": mesh, "distance": distance}
         paths = {name: Path(path) for name, path in given.items() if path is not None}
         for name, path in paths.items():
-            if path.suffix.lower() not in endings[name]:
+            if path.suffix.lower() not in _ENDINGS[name]:
                 raise ArgumentError(
                     name,
-                    expected=f"a file that ends in {', '.join(endings[name])}",
+                    expected=f"a file that ends in {', '.join(_ENDINGS[name])}",
                     found=str(path),
                 )
         if not paths:
@@ -111,7 +110,11 @@ class MapFiles:
                 expected="files of different names",
                 found=", ".join(map(str, paths.values())),
             )
-        if distance is not None and grid is None:
+        if "trajectory" in paths and grid is not None:
+            raise ArgumentError(
+                "trajectory", expected="the map of a drive", found=f"that of {grid}"
+            )
+        if "distance" in paths and grid is None:
             raise ArgumentError(
                 "distance",
                 expected="the `grid` whose voxels it is of",
@@ -123,16 +126,21 @@ class MapFiles:
             grid is not None or "out" not in paths or paths["out"].suffix.lower() == OCTOMAP
         ):
             raise ArgumentError(
-                "actors", expected="a file of points of a drive in `out`", found=str(grid or out)
+                "actors",
+                expected="a file of points of a drive in `out`",
+                found=str(grid or paths.get("out")),
             )
         folder = paths["out"].with_name(f"{paths['out'].stem}_actors") if actors else None
-        return cls(paths.get("out"), paths.get("mesh"), paths.get("distance"), folder)
+        out, mesh, far, trajectory = (paths.get(name) for name in _ENDINGS)
+        return cls(out, mesh, far, trajectory, folder)
 
     @property
     def all(self) -> list[Path]:
         """All files, and the folder."""
         return [
-            path for path in (self.out, self.mesh, self.distance, self.actors) if path is not None
+            path
+            for path in (self.out, self.mesh, self.distance, self.trajectory, self.actors)
+            if path is not None
         ]
 
     def check(self, overwrite: bool) -> None:
@@ -150,21 +158,11 @@ class MapFiles:
             if needed:
                 import_extra(module, extra)
 
-    def folder(self) -> tempfile.TemporaryDirectory[str]:
-        """Return a folder beside the map for cells that do not fit into memory; it is removed at
-        the end, also after Ctrl-C.
-        """
-        place = self.all[0].parent
-        with writing(place):
-            place.mkdir(parents=True, exist_ok=True)
-            return tempfile.TemporaryDirectory(
-                dir=place, prefix=f".{self.all[0].name}.", suffix=".part"
-            )
-
     def write(self, points: PointPieces, cells: Callable[[], MapCells]) -> None:
         """Write the points, or the tree, and the mesh; `cells` returns the cells of the tree and
         the mesh.
         """
+        self.begin()
         is_tree = self.out is not None and self.out.suffix.lower() == OCTOMAP
         if self.out is not None and not is_tree:
             write_points(self.out, points)
@@ -182,6 +180,12 @@ class MapFiles:
 
 
 MESH_ENDINGS = (".ply", ".glb")
+_ENDINGS = {
+    "out": (*POINT_ENDINGS, OCTOMAP),
+    "mesh": MESH_ENDINGS,
+    "distance": (".npz",),
+    "trajectory": (".tum", ".txt"),
+}
 _BLOCK = 128  # number of cells along x and y that are meshed at once
 _STEPS = (
     1024  # positions of vertices are rounded to such parts of a cell, so that blocks share them

@@ -13,7 +13,7 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray, FloatArray, IntArray
 from carlasc.core.frames import FrameRange
-from carlasc.core.geometry import invert, mirror_poses, transform_points
+from carlasc.core.geometry import invert, mirror_poses, quaternions_of, transform_points
 from carlasc.core.grids import GridSpec, mirror_voxels
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.groundtruth.from_scans.feed import ScanFeed, WithoutScans
@@ -37,7 +37,7 @@ from carlasc.motion.tracks import MovingActors
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
-from carlasc.storage.files import to_json, write_atomic, writing
+from carlasc.storage.files import temporary_folder, to_json, write_atomic, writing
 from carlasc.storage.protocol import Source
 
 
@@ -70,10 +70,12 @@ def write_map(
     `carlasc.map`.
     """
     options = FromScans(window=(0, 0), motion=motion, poses=poses)
-    with files.folder() as folder:
-        drive = DriveMap.of(source, frames, options, GrowingCells(Path(folder), cell_m))
+    with temporary_folder(files.all[0]) as folder:  # of cells that do not fit into memory
+        drive = DriveMap.of(source, frames, options, GrowingCells(folder, cell_m))
         drive.fill(run, files.actors is not None)
         points, bodies = drive.write(files), 0
+        if files.trajectory is not None:
+            drive.write_trajectory(files.trajectory)
         if files.actors is not None and files.out is not None:
             bodies = drive.write_actors(files.actors, files.out.suffix.lower())
     return MapContent(points, len(drive.frames), bodies, drive.notes())
@@ -162,6 +164,16 @@ class DriveMap:
         return PointPieces(
             count, lambda: self.cells.points(group), self.inputs.metadata.classes, about
         )
+
+    def write_trajectory(self, path: Path) -> None:
+        """Write the pose of the sensor at each scan, in the format of TUM."""
+        sequence = self.inputs.feed.sequence
+        poses = np.stack([sequence.read_pose(frame) for frame in self.frames])
+        poses = mirror_poses(poses) if self.inputs.metadata.axes == "left" else poses
+        turns = quaternions_of(poses[:, :3, :3])[:, [1, 2, 3, 0]]
+        table = np.column_stack([sequence.times_of(self.frames), poses[:, :3, 3], turns])
+        lines = (" ".join(f"{value:.9g}" for value in row) for row in table.tolist())
+        write_atomic(path, "".join(f"{line}\n" for line in lines).encode())
 
     def write_actors(self, folder: Path, ending: str) -> int:
         """Write the body of each actor, in its own frame, and its poses; return the number of

@@ -8,9 +8,10 @@ import io
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from contextlib import closing, suppress
+from collections.abc import Sequence as Series
+from contextlib import closing
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from hashlib import sha256
 from itertools import groupby
 from pathlib import Path
@@ -19,7 +20,14 @@ import numpy as np
 
 from carlasc.core.arrays import Uint8Array
 from carlasc.core.frames import Frames
-from carlasc.errors import ArgumentError, CarlascError, check_types, reading
+from carlasc.errors import (
+    ArgumentError,
+    CarlascError,
+    MissingDataError,
+    check_types,
+    reading,
+    tried_twice,
+)
 from carlasc.groundtruth import FromScans
 from carlasc.groundtruth.from_scans.feed import ScanFeed, WithoutScans
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
@@ -39,11 +47,12 @@ from carlasc.metrics.pairs import Place
 from carlasc.motion.options import MotionOptions
 from carlasc.motion.tracks import MovingActors
 from carlasc.running.processes import one_pool, run_all
-from carlasc.running.spreading import Run, StepCounter
-from carlasc.storage import FolderSink, layout
+from carlasc.running.spreading import Part, Run, StepCounter
+from carlasc.storage import FolderSink, as_source, layout
 from carlasc.storage.inputs import SequenceFiles, combined, content_digests
 from carlasc.storage.protocol import SequenceWriter, Source
 from carlasc.storage.resuming import derived_key, read_derived
+from carlasc.storage.shares import Share, source_in
 
 _VERSION = 2  # version of the counts: it changes when the same input gives other sums
 _STRETCH, _STRETCHES = 8, 10  # frames of a stretch, and least number of stretches of a sequence
@@ -53,6 +62,7 @@ _REACH = 30  # frames before and after a stretch in which actors matter
 _BLOCK = 400  # frames for which actors are found together
 # name of the files of sums, and of other entries in them
 _SUMS, _WORST, _KEY = ("audit", "worst", "key")
+_PARTS = f"{layout.DERIVED}/parts"  # folder with a file of each finished part
 
 # a wrong frame: path, frame of the grid, frame of the scan, wrong voxels
 _Row = tuple[str, int, int, int]
@@ -74,9 +84,9 @@ class _Stretch:
         """The name of the sums, which differs for other grids, other scans or another window."""
         one, content = self.matched, sha256()
         for number, _ in self.frames:
-            with suppress(CarlascError, OSError):  # which is reported when the frame is counted
-                for array in one.read(number):
-                    content.update(b"" if array is None else array.tobytes())
+            # an error is reported when the frame is counted
+            for part in tried_twice(partial(one.read, number)) or ():
+                content.update(b"" if part is None else part.tobytes())
         about = (one.path, one.spec, self.frames, self.window, self.scans)
         return sha256(repr((_VERSION, *about, content.digest())).encode()).hexdigest()
 
@@ -155,7 +165,8 @@ def audit(
         MissingDataError: there are no grids, no scans, or none that belong together.
         FormatError: the geometry of the grids is not known.
     """
-    check_types(audit, locals())
+    given = dict(locals())
+    check_types(audit, given)
     start = time.perf_counter()
     if made_from is not None and not made_from[0] <= 0 <= made_from[1]:
         raise ArgumentError(
@@ -165,17 +176,30 @@ def audit(
         raise ArgumentError(
             "part", expected="`keep`, a folder in which parts are joined", found="no folder"
         )
-    matched = match_grids(grids, scans, grid, frames)
+    places = tuple(one.location if isinstance(one, Source) else str(one) for one in (grids, scans))
+    share, matched = Share(as_source(scans), run), list[MatchedGrids]()
+    try:
+        matched += match_grids(_grids_of(grids, share), share, grid, frames)
+    except MissingDataError:
+        if not share.others:
+            raise
     notes = [f"{one.path}: {note}" for one in matched for note in one.notes]
     stretches = [part for one in matched for part in _stretches_of(one, made_from, keep)]
-    with one_pool(run) as spread:
-        sums, worst, failures = _count_all(stretches, spread, notes)
+    with one_pool(share.run) as spread:
+        sums, worst, failures = _count_all(share.run.part.take(stretches), spread, notes)
     verdicts = {}
-    if sums is not None:
+    if keep is None or run.part.count == 1:
         verdicts = {one.path: _judge(Stretches(sums[one.path]), one, made_from) for one in matched}
+    else:
+        about = combined(*places, grid, made_from, str(frames), run.part.count)
+        target = FolderSink(keep).target
+        target.put(f"{_PARTS}/{about}-{run.part.number}", b"done")
+        done = [name for name in target.tree.entries(_PARTS) if name.startswith(f"{about}-")]
+        if len(done) == run.part.count:  # all that is counted is kept
+            return audit(**{**given, "run": replace(run, part=Part())})
     return AuditResult(
-        grids.location if isinstance(grids, Source) else str(grids),
-        scans.location if isinstance(scans, Source) else str(scans),
+        places[0],
+        places[1],
         verdicts,
         {one.path: len(one.frames) for one in matched},
         {one.path: one.frame_name for one in matched},
@@ -185,6 +209,14 @@ def audit(
         grid,
         time.perf_counter() - start,
     )
+
+
+def _grids_of(grids: Place, share: Share) -> Place:
+    """Return the grids of the sequences of a part, if they are in the folders of these."""
+    if not share.others:
+        return grids
+    opened = as_source(grids)
+    return source_in(opened, share.own) if {*share.own} <= {*opened.places()} else grids
 
 
 def voxels_of(
@@ -267,23 +299,18 @@ def _actors_of(
 
 
 def _count_all(
-    stretches: list[_Stretch], run: Run, notes: list[str]
-) -> tuple[dict[str, list[Sums]] | None, list[_Row], list[AuditFailure]]:
-    """Count the stretches of this part, and read those of others: sums by sequence, or None if some
-    do not exist yet; worst frames; failures.
-    """
-    own = run.part.take(range(len(stretches)))
+    stretches: Series[_Stretch], run: Run, notes: list[str]
+) -> tuple[dict[str, list[Sums]], list[_Row], list[AuditFailure]]:
+    """Count stretches: sums by sequence; worst frames; failures."""
     steps = StepCounter(run.progress, sum(len(stretch.frames) for stretch in stretches))
     steps(0)
     lengths = Counter(stretch.matched.path for stretch in stretches)
     sums = {path: [Sums() for _ in range(min(length, _DRAWN))] for path, length in lengths.items()}
-    worst, failures, is_whole, rows = list[_Row](), list[AuditFailure](), True, Counter[str]()
-    tasks = _with_actors((stretches[index] for index in own), run, notes)
+    worst, failures, rows = list[_Row](), list[AuditFailure](), Counter[str]()
+    tasks = _with_actors(stretches, run, notes)
     with closing(run_all(_Stretch.count, tasks, run, lost=_fail)) as results:
-        for index, stretch in enumerate(stretches):
-            counted, failed = next(results) if index in own else (stretch.read(), [])
-            is_whole &= counted is not None
-            counts, path = {**(counted or {})}, stretch.matched.path
+        for stretch, (counted, failed) in zip(stretches, results, strict=True):
+            counts, path = {**counted}, stretch.matched.path
             steps(len(stretch.frames))
             failures += failed
             rows_of = counts.pop(_WORST, np.empty((0, 3), np.int64)).tolist()
@@ -291,7 +318,7 @@ def _count_all(
             for name, array in counts.items():
                 add(sums[path][rows[path] * len(sums[path]) // lengths[path]], name, array)
             rows[path] += 1
-    return sums if is_whole else None, worst, failures
+    return sums, worst, failures
 
 
 def _fail(stretch: _Stretch, message: str) -> tuple[Sums, list[AuditFailure]]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from carlasc.core.compiling import cached
 from carlasc.core.geometry import invert, thin, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan
-from carlasc.errors import CarlascError
+from carlasc.errors import tried_twice
 from carlasc.inspection.auditing.geometry import families
 from carlasc.inspection.auditing.matching import MatchedGrids
 from carlasc.inspection.auditing.verdicts import Sums, add
@@ -193,10 +193,7 @@ class FrameCounter:
         """Return the scan of another frame; None if it does not exist or cannot be read (its own
         frame reports the error).
         """
-        try:
-            return self._scan(frame) if frame in self.matched.seconds else None
-        except (CarlascError, OSError):
-            return None
+        return tried_twice(partial(self._scan, frame)) if frame in self.matched.seconds else None
 
     def _grid_T_world(self, frame: int) -> FloatArray | None:
         pose = self.matched.poses.get(frame)

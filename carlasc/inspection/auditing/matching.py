@@ -39,6 +39,7 @@ from carlasc.storage import as_source, layout
 from carlasc.storage.files import parse_json
 from carlasc.storage.layout import identity_of
 from carlasc.storage.protocol import Sequence
+from carlasc.storage.shares import Share
 from carlasc.storage.voxel_files import GridFrames, VoxelFormat, VoxelFrames, is_counted
 
 _SAME_TIME_S = 0.06  # a grid belongs to a scan if their times differ by less; fact: same-time
@@ -229,7 +230,8 @@ def match_grids(grids: Place, scans: Place, grid: str | None, frames: Frames) ->
         advice = "give the recording in the layout, such as `carlasc convert` writes it"
         expected = "sequences with scans (velodyne/)"
         raise MissingDataError(source.location, expected=expected, found="none", advice=advice)
-    pairs = [(one, _recording_of(one, recordings, alone=len(sequences) == 1)) for one in sequences]
+    alone = len(sequences) == 1 and not (isinstance(source, Share) and source.others)
+    pairs = [(one, _recording_of(one, recordings, alone=alone)) for one in sequences]
     matched = [
         _match_frames(one, own, FrameRange.of(frames)) for one, own in pairs if own is not None
     ]

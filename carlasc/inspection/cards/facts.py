@@ -255,8 +255,8 @@ def gather(source: Source, details: CardDetails, every: int, run: Run, *, draft:
             gaps[0].partition(" ")[0],
             expected=f"{', '.join(gaps)} of {source.location}, which only the author can state",
             found="none",
-            advice="state them, or mark the gaps with `draft=True`; carlasc.json of simulated data "
-            'has "simulated": true',
+            advice="state what is missing, or mark the gaps with `draft=True`; carlasc.json of "
+            'simulated data has "simulated": true',
         )
     overview = info(source)
     tables: dict[str, dict[str, StoredSequence]] = {}

@@ -104,8 +104,8 @@ class DeferredErrorFile(io.RawIOBase):
     """A new file for libraries that do not handle failed writes.
 
     After a failed write, h5py crashes, pyarrow prints an error of its destructor, and Foxglove
-    ignores it. This file keeps the first error and drops all later writes; `check` raises the
-    error.
+    ignores it or raises one of its own, also after Ctrl-C. This file keeps the first error and
+    drops all later writes; `check` raises the error.
     """
 
     def __init__(self, path: Path, place: Path | None) -> None:
@@ -122,7 +122,7 @@ class DeferredErrorFile(io.RawIOBase):
         super().__init__()
         self._path, self._place = path, place
         self._position = self._size = 0
-        self._error: OSError | None = None
+        self._error: OSError | KeyboardInterrupt | None = None
         self._descriptor = -1  # until it is open
         try:
             make_folder(path.parent)
@@ -139,7 +139,7 @@ class DeferredErrorFile(io.RawIOBase):
             StorageError: a write failed.
         """
         if self._error is not None:
-            if self._place is None:
+            if self._place is None or isinstance(self._error, KeyboardInterrupt):
                 raise self._error
             raise storage_error(self._place, self._error) from self._error
 
@@ -148,7 +148,7 @@ class DeferredErrorFile(io.RawIOBase):
         if self._error is None:
             try:
                 return call(*arguments)
-            except OSError as error:
+            except (OSError, KeyboardInterrupt) as error:
                 self._error = error
         return None
 

@@ -260,6 +260,16 @@ class StoredField:
                 self.target.put(path, format_table(there | ours))
             self._tables[block] = there
 
+    def remove(self, frames: set[int]) -> None:
+        """Remove frames from the tables of their blocks."""
+        for block in {frame // self.options.block for frame in frames}:
+            path, there = table_path(self.node, block), self.table(block)
+            self._tables[block] = {f: counts for f, counts in there.items() if f not in frames}
+            if not self._tables[block]:
+                self.target.remove(path)
+            elif self._tables[block] != there:
+                self.target.put(path, format_table(self._tables[block]))
+
 
 def _merge(there: bytes, new: Mapping[int, bytes], taken: set[int], room: int, where: str) -> bytes:
     """Return the bytes of a shard with new chunks, and with the existing chunks whose slots are not

@@ -15,7 +15,11 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray
 from carlasc.errors import ConflictError, MissingDataError, check_types
+from carlasc.running.spreading import Run
 from carlasc.storage.files import AnyPath, damaged, parse_json, remove_stale, to_json
+from carlasc.storage.folder import FolderWriter
+from carlasc.storage.inputs import MadeFrom
+from carlasc.storage.layout import place_of
 from carlasc.storage.packed.array_layout import (
     FIELD,
     SEQUENCE,
@@ -27,6 +31,9 @@ from carlasc.storage.packed.array_layout import (
 )
 from carlasc.storage.packed.chunks import SHUFFLE, Encoding, in_threads
 from carlasc.storage.packed.stores import STORE, VERSION, check_names
+from carlasc.storage.protocol import Sequence
+from carlasc.storage.published import PublishedSource
+from carlasc.storage.shares import read_list
 from carlasc.storage.transport.remote_tree import target_of
 from carlasc.storage.transport.trees import LocalTarget, Target
 from carlasc.storage.zarr.block_tables import block_of, parse_table
@@ -100,9 +107,14 @@ class StoreNodes:
 
 
 def finish(
-    out: AnyPath | Target, *, incomplete: bool = False, **storage_options: Any
+    out: AnyPath | Target,
+    *,
+    incomplete: bool = False,
+    sequences_from: AnyPath | None = None,
+    **storage_options: Any,
 ) -> FinishedStore:
-    """Write the metadata of a zarr store, so that it can be opened.
+    """Check that an output that was written in parts is complete, and write the metadata of a zarr
+    store, so that it can be opened.
 
     The last part of a run does this automatically. Use this function if a part failed or was never
     run. A finished store is updated with the frames that were added to it.
@@ -110,6 +122,8 @@ def finish(
     Args:
         out: the store: a path, or a URL of an object store.
         incomplete: finish the store even if frames are missing.
+        sequences_from: file with the folders of the sequences of the run, one per line: those that
+            do not exist are missing. None: sequences that no part began are not known.
         **storage_options: options of fsspec for a URL.
 
     Returns:
@@ -118,10 +132,38 @@ def finish(
     Raises:
         ConflictError: announced frames are missing, and `incomplete` is not given.
         FormatError: a file of the store is damaged.
-        MissingDataError: `out` is not a zarr store of the present version.
+        MissingDataError: `out` is neither a zarr store of the present version nor a folder of
+            sequences.
     """
     check_types(finish, locals())
     target = target_of(out, **storage_options)
+    found = {} if read_root(target) else PublishedSource(target.tree).sequences_in([""])
+    found = {path: sequence for path, sequence in found.items() if sequence.fields()}
+    result = _look_at(target, found) if found else _finish_store(target, incomplete)
+    if sequences_from is not None:
+        begun = {place_of(path) for path in result.sequences}
+        listed = read_list(Run(sequences_from=sequences_from), list)
+        result.missing |= {place: {"sequences": 1} for place in listed if place not in begun}
+    if result.missing and not incomplete:
+        raise _missing(result, _OTHER_RULE)
+    return result
+
+
+def _look_at(target: Target, found: Mapping[str, Sequence]) -> FinishedStore:
+    """Return the grids in a folder, and the frames that a run announced and did not make."""
+    result = FinishedStore(target.location)
+    for path, sequence in found.items():
+        result.sequences[path] = {name: len(sequence.frames(name)) for name in sequence.fields()}
+        writer, missing = FolderWriter(target.below(path)), dict[str, int]()
+        for grid in sequence.grids:
+            announced = map(int, MadeFrom.read(writer, f"made-{grid}").frames)
+            missing[grid] = sum(not writer.has(f"{grid}/labels", frame) for frame in announced)
+        if missing := {grid: number for grid, number in missing.items() if number}:
+            result.missing[path] = missing
+    return result
+
+
+def _finish_store(target: Target, incomplete: bool) -> FinishedStore:
     if isinstance(target, LocalTarget):
         remove_stale(target.folder)
     paths = sorted(target.paths())
@@ -252,7 +294,11 @@ def format_expected(frames: Mapping[str, set[int]]) -> bytes:
     return to_json(ranges)
 
 
-def _missing(result: FinishedStore) -> ConflictError:
+_AGAIN = "run the same command again, or give `incomplete=True`"
+_OTHER_RULE = f"parts of another rule, or of another number, leave such gaps: {_AGAIN}"
+
+
+def _missing(result: FinishedStore, advice: str = _AGAIN) -> ConflictError:
     path, fields = next(iter(result.missing.items()))
     name, count = next(iter(fields.items()))
     total = sum(sum(counts.values()) for counts in result.missing.values())
@@ -261,5 +307,5 @@ def _missing(result: FinishedStore) -> ConflictError:
         result.location,
         expected="all frames that the run announced",
         found=f"{count} of {name} missing in {path or 'its sequence'}{more}",
-        advice="run the same command again, or give `incomplete=True`",
+        advice=advice,
     )

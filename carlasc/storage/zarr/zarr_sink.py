@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from functools import partial
@@ -136,6 +136,13 @@ class ZarrWriter(SequenceWriter):
             self._start()
             self.target.put(f"{self.group}/{EXPECTED}", format_expected(merged))
 
+    def is_complete(self) -> bool:
+        """Whether the announced frames are written."""
+        expected = read_expected(self.target, self.group)
+        return bool(expected) and all(
+            self.has(name, frame) for name, frames in expected.items() for frame in frames
+        )
+
     def has(self, field: str, frame: int) -> bool:
         """Whether this or another process has written the frame."""
         layout.field_named(field)
@@ -166,6 +173,10 @@ class ZarrWriter(SequenceWriter):
         self._start()
         self.target.put(path, data)
 
+    def remove_document(self, name: str) -> None:
+        """Remove a text file, if it exists."""
+        self.target.remove(self._document(name))
+
     def create_document(self, name: str, data: bytes) -> bool:
         """Write a text file unless it exists."""
         path = self._document(name)
@@ -186,6 +197,17 @@ class ZarrWriter(SequenceWriter):
         self._fields = {
             name: field for name, field in self._fields.items() if not name.startswith(f"{grid}/")
         }
+
+    def remove_frames(self, fields: Iterable[str], frames: Collection[int]) -> None:
+        """Remove fields of some frames, if they exist. Their bytes stay in the objects of their
+        blocks until these are written again.
+        """
+        gone, known = {*frames}, read_expected(self.target, self.group)
+        left = known | {name: known[name] - gone for name in {*fields} & known.keys()}
+        if left != known:
+            self.target.put(f"{self.group}/{EXPECTED}", format_expected(left))
+        for name in fields:
+            self._field(name).remove(gone)
 
     def close(self) -> None:
         """Create the sequence, if nothing was written to it."""

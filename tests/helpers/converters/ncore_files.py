@@ -109,15 +109,16 @@ def write_store(
     drive: SimulatedDrive,
     *,
     version: str = "v4",
+    sequence: str = "drive 1",
     edit: Callable[[dict], object] = bool,
 ) -> Path:
-    """Write a store, and return its file; `edit` may change what it holds, as `contents` returns
+    """Write a store of a sequence, and return its file; `edit` may change what it holds, as `contents` returns
     it.
 
     `edit` may add "cameras": for each name `lens`, its attributes in the component "intrinsics",
     `rig_T_camera`, and `images`: file and format by (start, end) in microseconds.
     """
-    content = contents(drive)
+    content, file = contents(drive), f"{sequence.split(maxsplit=1)[0]}.ncore4.zarr.itar"
     edit(content)
     members: dict[str, bytes] = {}
     metadata: dict[str, dict] = {}
@@ -131,7 +132,7 @@ def write_store(
 
     metadata[".zgroup"] = {"zarr_format": 2}
     metadata[".zattrs"] = {
-        "sequence_id": "drive 1",
+        "sequence_id": sequence,
         "version": version,
         "component_group_name": "",
         "generic_meta_data": {},
@@ -199,7 +200,7 @@ def write_store(
     group("poses/default/dynamic_poses", **{str(("rig", "world")): moving})
     group("cuboids/default", component_version="v1")
     group("cuboids/default/cuboids", cuboid_track_observations=content["observations"])
-    path = folder / "drive.ncore4.zarr.itar"
+    path = folder / file
     _write_archive(
         path,
         members

@@ -258,6 +258,7 @@ def test_a_frame_before_the_start_and_no_sensor_are_refused(drive: TownDrive) ->
         drive.reference_observations(0, sensors=0)
 
 
+@pytest.mark.slow
 def test_every_sensor_and_frame_has_its_own_noise(drive: TownDrive) -> None:
     quiet = copy(drive)
     quiet.lidar = replace(drive.lidar, noise_m=0.0)
@@ -278,6 +279,7 @@ def test_every_sensor_and_frame_has_its_own_noise(drive: TownDrive) -> None:
             )
 
 
+@pytest.mark.slow
 def test_sensors_far_from_the_vehicle_see_everything_within_their_range(drive: TownDrive) -> None:
     """A larger snapshot of the town gives the same scans."""
     wide = copy(drive)

@@ -112,6 +112,7 @@ def test_frames_do_not_depend_on_those_recorded_before(recorded: Path, tmp_path:
     assert all(alone[name] == whole[name] for name in frames)
 
 
+@pytest.mark.slow
 def test_a_second_run_goes_on_and_ends_with_the_same_bytes(recorded: Path, tmp_path: Path) -> None:
     first = simulate(tmp_path, **{**SMALL, "count": 2}, run=Run(workers=1))
     (tmp_path / "raw" / "labels1" / "1.npy").unlink()
@@ -125,6 +126,7 @@ def test_a_second_run_goes_on_and_ends_with_the_same_bytes(recorded: Path, tmp_p
     assert Capture(tmp_path).read_time(1, 1) == pytest.approx(0.1)
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_leaves_whole_files_and_is_finished_by_the_next(
     recorded: Path, tmp_path: Path
 ) -> None:

@@ -19,6 +19,7 @@ def test_the_same_seed_builds_the_same_town(drive: TownDrive, twin: TownDrive) -
     np.testing.assert_array_equal(again.mesh.labels, drive.town.mesh.labels)
 
 
+@pytest.mark.slow
 def test_another_seed_builds_another_town(drive: TownDrive) -> None:
     other = build_town(np.random.default_rng(1234))
     assert other.mesh.vertices.shape != drive.town.mesh.vertices.shape

@@ -21,6 +21,7 @@ def footprint(actor: TownActor) -> Rectangle:
     return Rectangle(middle, (float(high[0] - low[0]), float(high[1] - low[1])), yaw)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", range(0, 400, 25))
 def test_vehicles_do_not_overlap(drive: TownDrive, frame: int) -> None:
     actors = drive.actors(frame)

@@ -145,6 +145,7 @@ class TestFileURL(SourceContract):
         return carlasc.open(published.as_uri())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["folder", "zip", "zarr", "h5", "parquet"])
 def test_every_kind_is_read_over_http(
     published: Path, site: tuple[Path, str, type[RangeHandler]], kind: str
@@ -241,6 +242,7 @@ def read_all(source: Source) -> dict[str, Any]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", ["503", "drop", "cut", "too long", "too short", "other range"])
 def test_a_zip_is_read_from_a_web_server_that_fails_now_and_then(
     published: Path, site: tuple[Path, str, type[RangeHandler]], fault: str
@@ -299,6 +301,7 @@ def test_an_unknown_scheme_is_one_clear_error() -> None:
         carlasc.open("gopher://x/y")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["folder", "zip", "zarr"])
 def test_every_kind_is_read_from_s3(
     published: Path, tmp_path: Path, bucket: tuple[str, dict[str, Any]], kind: str

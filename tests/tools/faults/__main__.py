@@ -18,7 +18,13 @@ from pathlib import Path
 
 from measuring.figures import Figures, publish
 
+from faults.commands import COMMANDS
 from faults.figures import KINDS, keep
+
+
+def chosen_commands(wanted: list[str]) -> list[str]:
+    """Return the names of commands, given without what follows: "regrid" for all of regrid."""
+    return [name for name in COMMANDS if any(f"{name}-".startswith(f"{one}-") for one in wanted)]
 
 
 def main() -> int:
@@ -42,6 +48,14 @@ def main() -> int:
         action="store_true",
         help="leave the figures in the documentation as they are",
     )
+    parser.add_argument(
+        "--command",
+        action="append",
+        help="only this command, such as `regrid` (all of its cases); may be given several times",
+    )
+    parser.add_argument(
+        "--add", action="store_true", help="add the cases to those of earlier seeds in the figures"
+    )
     given = parser.parse_args()
     found = []
     for name in given.only or KINDS:
@@ -50,8 +64,9 @@ def main() -> int:
             print(f"{name}: there is no {kind.module}")
             continue
         folder = Path(tempfile.mkdtemp(prefix=f"faults-{name}-"))
+        chosen = {"names": chosen_commands(given.command)} if given.command else {}
         outcome = import_module(kind.module).run(
-            given.count or getattr(kind, given.size), given.seed, folder
+            given.count or getattr(kind, given.size), given.seed, folder, **chosen
         )
         print(
             f"{name}: {outcome.tried:,} tried, {len(outcome.found)} faults, {outcome.seconds:.0f} s",
@@ -62,7 +77,7 @@ def main() -> int:
         if not outcome.found:
             shutil.rmtree(folder)
         if not given.keep_figures:
-            keep(outcome, datetime.datetime.now(datetime.UTC).date())
+            keep(outcome, datetime.datetime.now(datetime.UTC).date(), add=given.add)
             publish(Figures.read())
     return int(bool(found))
 

@@ -52,8 +52,7 @@ class Command:
         output: what it writes there.
         needs: packages that must be installed.
         workers: processes that it works with; None for a command without `--workers`.
-        timed: whether its bytes hold a time or the duration of the run, so that only what it reads
-            as can be compared.
+        slow: whether it takes so long that it is tried less often.
     """
 
     name: str
@@ -62,7 +61,7 @@ class Command:
     output: str
     needs: tuple[str, ...] = ()
     workers: int | None = 1
-    timed: bool = False
+    slow: bool = False
 
     @property
     def argv(self) -> list[str]:
@@ -83,9 +82,10 @@ class Command:
 
 
 _ZARR, _HDF5, _PARQUET = ("numcodecs", "pcodec"), ("h5py", "hdf5plugin"), ("pyarrow",)
+_SAME = "--grid evaluation_16x16x8 --truth-grid evaluation_16x16x8"
 _PICTURES = ("embreex", "PIL", "imageio_ffmpeg")
 
-_ALL = (
+EVERY = (
     Command("simulate", f"simulate out {SIMULATED}", (), "out"),
     Command("simulate-zarr", f"simulate out.zarr {SIMULATED} {GRID}", (), "out.zarr", _ZARR),
     Command("simulate-workers", f"simulate out {SIMULATED}", (), "out", workers=2),
@@ -151,10 +151,56 @@ _ALL = (
     Command("unpack", "unpack scene.zarr out", ("scene.zarr",), "out", _ZARR),
     Command("export-kitti", "export kitti scene out", ("scene",), "out"),
     Command("convert-scans", f"convert scans scans out {GRID} --force", ("scans",), "out"),
+    Command(
+        "convert-bag", "convert bag bag out --grids none --force", ("bag",), "out", ("rosbags",)
+    ),
+    Command(
+        "convert-ncore",
+        f"convert ncore ncore out {GRID} --force",
+        ("ncore",),
+        "out",
+        ("cbor2", "numcodecs"),
+    ),
     Command("label", "label scene -o out --from labels", ("scene", "labels"), "out"),
     Command("label-motion", "label scene -o out --from motion", ("scene",), "out"),
+    Command("label-images", "label seen -o out --from images", ("seen",), "out", _PICTURES),
     Command("refine", "refine scene -o out --refine always", ("scene",), "out"),
     Command("map", "map scene out.ply", ("scene",), "out.ply"),
+    Command("audit-keep", "audit merged merged --keep out", ("merged",), "out"),
+    Command(
+        "capture",
+        "capture out --count 2 --sensors 2 --traffic light --no-bev",
+        (),
+        "out",
+        ("carla",),
+        None,
+    ),
+    Command("demo", "demo out --count 2 --sensors 1", (), "out", _PICTURES, slow=True),
+    Command("view-page", "view scene -o out.html --overwrite", ("scene",), "out.html", (), None),
+    Command("view-folder", "view scene -o out --overwrite", ("scene",), "out", (), None),
+    Command(
+        "view-foxglove",
+        "view scene -o out.mcap --overwrite",
+        ("scene",),
+        "out.mcap",
+        ("mcap",),
+        None,
+    ),
+    Command(
+        "evaluate-plot",
+        f"evaluate scene scene {_SAME} --plot out.png",
+        ("scene",),
+        "out.png",
+        ("matplotlib",),
+    ),
+    Command(
+        "scores",
+        "scores scores.json -o out.html --overwrite",
+        ("scores.json",),
+        "out.html",
+        (),
+        None,
+    ),
     Command(
         "render-picture", f"render scene -o out.png {PICTURE}", ("scene",), "out.png", _PICTURES
     ),
@@ -165,7 +211,6 @@ _ALL = (
         "report scene --html out.html --save --remake --holdout",
         ("scene",),
         "out.html",
-        timed=True,
     ),
     Command(
         "card",
@@ -191,9 +236,12 @@ _ALL = (
     Command("finish", "finish parts.zarr --incomplete", ("parts.zarr",), "parts.zarr", _ZARR, None),
 )
 
+READ_ONLY = ("info", "validate", "doctor")
+"""The commands that only print."""
+
 COMMANDS = {
     command.name: command
-    for command in _ALL
+    for command in EVERY
     if all(find_spec(package) for package in (*command.needs, "trimesh", "embreex"))
 }
 """The commands whose packages are installed, by name.
@@ -208,6 +256,11 @@ _MADE_BY = {
         f"regrid drive -o scene {GRID}",
         "regrid scene --observe grid --size 8,8,4 --name evaluation_copy",
     ),
+    "seen": (f"simulate seen {SIMULATED} {GRID} --cameras front",),
+    "merged": (
+        f"regrid drive -o merged {GRID} --name evaluation",
+        f"regrid merged {GRID} --observe scans --name evaluation --overwrite",
+    ),
     **{f"scene.{kind}": (f"pack scene scene.{kind}",) for kind in ("zarr", "h5", "parquet")},
     "parts.zarr": (f"regrid drive -o parts.zarr {GRID} --frames 0 --part 1/2",),
 }
@@ -217,6 +270,7 @@ _MADE_FROM = {
     "scene.h5": "scene",
     "scene.parquet": "scene",
     "parts.zarr": "drive",
+    "merged": "drive",
 }
 
 
@@ -237,16 +291,21 @@ def build_inputs(base: Path, commands: Iterable[Command] | None = None) -> None:
     wanted = {name for command in (commands or COMMANDS.values()) for name in command.inputs}
     if "kitti" in wanted:
         write_tiny_kitti(base / "kitti", frames=2, voxels=True)
-    if "scans" in wanted:
+    for name in wanted & {"scans", "bag", "ncore"}:
         from faults.foreign import DATA_SETS
 
-        DATA_SETS["scans"](base / "scans")
+        DATA_SETS[name](base / name)
     if "labels" in wanted:
         _make("scene", base)
         (labels,) = (base / "scene").rglob("labels")
         shutil.copytree(labels, base / "labels")
-    for name in wanted - {"kitti", "scans", "labels"}:
+    for name in wanted & _MADE_BY.keys():
         _make(name, base)
+    if "scores.json" in wanted:
+        _make("scene", base)
+        _run_step(f"evaluate scene scene {_SAME} --json", base)
+        printed = (base / MESSAGES).read_text()
+        (base / "scores.json").write_text(printed[printed.index("{") : printed.rindex("}") + 1])
 
 
 def _make(name: str, base: Path) -> None:
@@ -256,8 +315,12 @@ def _make(name: str, base: Path) -> None:
     if name in _MADE_FROM:
         _make(_MADE_FROM[name], base)
     for step in _MADE_BY[name]:
-        if code := wait(start([*step.split(), "--workers", "1"], base), 120):
-            raise RuntimeError(f"carlasc {step}: exit code {code}: {(base / MESSAGES).read_text()}")
+        _run_step(step, base)
+
+
+def _run_step(step: str, base: Path) -> None:
+    if code := wait(start([*step.split(), "--workers", "1"], base), 120):
+        raise RuntimeError(f"carlasc {step}: exit code {code}: {(base / MESSAGES).read_text()}")
 
 
 MESSAGES = "messages.txt"
@@ -330,6 +393,10 @@ def run_here(argv: list[str]) -> int:
     """Run a command in this process, and return its exit code."""
     from carlasc.cli import app
 
+    if argv[0] == "capture":
+        from helpers.servers.carla_server import FakeServer
+
+        sys.modules["carla"] = FakeServer()  # type: ignore[assignment]
     try:
         app(argv, prog_name="carlasc")
     except SystemExit as end:

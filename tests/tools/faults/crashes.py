@@ -59,7 +59,7 @@ def run(count: int, seed: int, folder: Path, names: Sequence[str] | None = None)
     """
     began = time.monotonic()
     tried, found = run_with_library("faults.crashes", count, seed, folder, names or RECORDED)
-    return Outcome("crashes", tried, found, time.monotonic() - began)
+    return Outcome.of("crashes", began, tried, found)
 
 
 def _try_command(
@@ -175,6 +175,7 @@ class _File:
 
     now: bytearray
     synced: bytes = b""
+    time: int | None = None  # of modification, ns, of a file that was there before
 
 
 @dataclass(eq=False)
@@ -218,6 +219,7 @@ class Disk:
         else:
             file = folder.now.get(name)
             if isinstance(file, _File):
+                file.time = None
                 _write(file.now, call)
 
     def _at(self, path: str) -> tuple[_Folder, str]:
@@ -267,7 +269,8 @@ def _read(folder: Path) -> _Folder:
     found = _Folder()
     for path in folder.iterdir():
         data = b"" if path.is_dir() else path.read_bytes()
-        found.now[path.name] = _read(path) if path.is_dir() else _File(bytearray(data), data)
+        file = _File(bytearray(data), data, path.stat().st_mtime_ns)
+        found.now[path.name] = _read(path) if path.is_dir() else file
     found.stored = dict(found.now)
     return found
 
@@ -286,6 +289,8 @@ def _build(folder: _Folder, place: Path, loss: str, rng: np.random.Generator) ->
             _build(node, place / name, loss, rng)
         else:
             (place / name).write_bytes(_after(node, loss, rng))
+            if node.time is not None:
+                os.utime(place / name, ns=(node.time, node.time))
 
 
 def _write(data: bytearray, call: Call) -> None:

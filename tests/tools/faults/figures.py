@@ -7,6 +7,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import json
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,14 @@ KINDS = {
         200,
         5_000,
     ),
+    "large": Kind(
+        "faults.large",
+        "commands on large data",
+        "Frames, sequences, points of a scan and voxels double twice: in the second doubling, an "
+        "item costs no more time and memory than in the first",
+        1,
+        1_000,
+    ),
     "mutations": Kind(
         "faults.mutations",
         "damaged files",
@@ -98,14 +107,14 @@ KINDS = {
 """Every kind, in the order of the table. A kind that has no module yet is left out of a run."""
 
 
-def keep(outcome: Outcome, date: datetime.date) -> None:
-    """Write an outcome into the figures, in place of the one of its kind."""
+def keep(outcome: Outcome, date: datetime.date, *, add: bool = False) -> None:
+    """Write an outcome into the figures, in place of the one of its kind, or added to it."""
     rows = read()
-    rows[outcome.kind] = {
-        "date": date.isoformat(),
-        **dataclasses.asdict(outcome),
-        "seconds": round(outcome.seconds),
-    }
+    row = dataclasses.asdict(outcome) | {"seconds": round(outcome.seconds)}
+    if add and (before := rows.get(outcome.kind)):
+        row |= {name: before[name] + row[name] for name in ("tried", "found", "seconds")}
+        row["commands"] = dict(Counter(before.get("commands", {})) + Counter(outcome.commands))
+    rows[outcome.kind] = {"date": date.isoformat(), **row}
     FIGURES.write_text(
         json.dumps({kind: rows[kind] for kind in KINDS if kind in rows}, indent=2) + "\n"
     )
@@ -128,6 +137,16 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
             f"| {name} | {KINDS[name].what} | {row['tried']:,} | {len(row['found'])} | {minutes} | "
             f"{row['date']} |"
         )
+    return "\n".join(lines)
+
+
+def commands(rows: dict[str, dict[str, Any]]) -> str:
+    """Return the table of the number of cases of each command."""
+    kinds = {name: row["commands"] for name, row in rows.items() if row.get("commands")}
+    lines = [f"| command | {' | '.join(kinds)} |", "|---|" + "---|" * len(kinds)]
+    for command in sorted({command for counts in kinds.values() for command in counts}):
+        counts = " | ".join(f"{counts.get(command, 0):,}" for counts in kinds.values())
+        lines.append(f"| `{command}` | {counts} |")
     return "\n".join(lines)
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
@@ -14,9 +15,16 @@ class Outcome:
         tried: number of cases that were really run.
         found: one line per case that failed, with what repeats it (command, seed, number).
         seconds: how long it took.
+        commands: number of cases of each command, where cases are of commands.
     """
 
     kind: str
     tried: int
     found: list[str]
     seconds: float
+    commands: dict[str, int] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, kind: str, began: float, tried: dict[str, int], found: list[str]) -> Outcome:
+        """Return the outcome of commands that were tried since a time of `time.monotonic`."""
+        return cls(kind, sum(tried.values()), found, time.monotonic() - began, tried)

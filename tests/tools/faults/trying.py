@@ -31,18 +31,19 @@ def shares(names: Sequence[str], count: int) -> dict[str, int | None]:
 
 def try_commands(
     attempt: Try, cases: Mapping[str, int | None], seed: int, folder: Path
-) -> tuple[int, list[str]]:
-    """Try each command with its number of cases.
+) -> tuple[dict[str, int], list[str]]:
+    """Try each command with its number of cases; returns how many of each were tried, and what was
+    found.
 
     The folders of commands for which something was found stay in `folder`.
     """
     build_inputs(folder / "inputs", [COMMANDS[name] for name in cases])
-    tried, found = 0, []
+    tried, found = dict[str, int](), list[str]()
     with serving():
         for name, count in cases.items():
-            some, faults = _in_a_child(attempt, COMMANDS[name], count, seed, folder)
-            tried, found = tried + some, found + faults
-            print(f"{name}: {some} cases, {len(faults)} faults", flush=True)
+            tried[name], faults = _in_a_child(attempt, COMMANDS[name], count, seed, folder)
+            found += faults
+            print(f"{name}: {tried[name]} cases, {len(faults)} faults", flush=True)
     return tried, found
 
 
@@ -73,7 +74,7 @@ def _in_a_child(
 
 def run_with_library(
     module: str, count: int, seed: int, folder: Path, names: Sequence[str]
-) -> tuple[int, list[str]]:
+) -> tuple[dict[str, int], list[str]]:
     """Try commands in another Python, into which the library of calls.c is loaded: it runs
     `module`, which calls `main`.
     """

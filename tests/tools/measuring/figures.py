@@ -118,6 +118,7 @@ class Figures:
         rows = faults.read()
         other = {
             "faults.table": faults.table(rows),
+            "faults.commands": faults.commands(rows),
             "faults.line": faults.line(rows),
             "figures.machine": self._machine(),
         }

@@ -121,6 +121,7 @@ def test_with_a_still_camera_a_static_block_stays_in_place(drive, tmp_path, view
     np.testing.assert_allclose(places, np.broadcast_to(places[0], (4, 2)), atol=1.2)
 
 
+@pytest.mark.slow
 def test_two_processes_draw_what_one_draws(drive, tmp_path):
     one, two = (
         render(drive, tmp_path / f"{n}.gif", style=StyleOptions(size=(160, 90)), run=Run(n)).out

@@ -1,0 +1,214 @@
+"""`convert` of a list of clips: each is fetched, converted, and deleted again, while the next is
+fetched.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from carlasc.converting.plans import sequence_path
+from carlasc.converting.protocol import Failure
+from carlasc.converting.registry import find_recordings, open_converter
+from carlasc.errors import (
+    ArgumentError,
+    CarlascError,
+    ConflictError,
+    MissingDataError,
+    StorageError,
+    without_credentials,
+)
+from carlasc.running.processes import one_pool, run_all
+from carlasc.running.spreading import Part, Run, StepCounter
+from carlasc.storage import layout
+from carlasc.storage.files import AnyPath, to_json, writing
+from carlasc.storage.folder import FolderSink
+from carlasc.storage.inputs import combined
+from carlasc.storage.opening import PACKED
+from carlasc.storage.shares import read_list
+from carlasc.storage.transport.remote_tree import RemoteTree, tree_of
+from carlasc.storage.transport.trees import is_url
+
+_BLOCK = 16 << 20  # bytes per request
+_UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
+
+
+@dataclass(frozen=True)
+class Clips:
+    """Clips to convert, one after the other.
+
+    Attributes:
+        names: their places: URLs, or paths below `source`.
+        source: a folder or a URL.
+        out: the folder to write to.
+        convert: the function `convert`.
+        arguments: its arguments, without source, output and run.
+        scratch: folder for what is fetched.
+        most: largest size of the scratch, bytes.
+    """
+
+    names: tuple[str, ...]
+    source: str
+    out: AnyPath
+    convert: Callable[..., Any]
+    arguments: Mapping[str, Any]
+    scratch: Path
+    most: int
+
+    def run(self, run: Run = Run(workers=1)) -> Iterator[Any]:  # noqa: B008 (frozen)
+        """Yield the result of each clip that is not done yet; a `Failure` if it has none.
+
+        Raises:
+            StorageError: the output or the scratch cannot be written.
+        """
+        sink = FolderSink(self.out)
+        todo = [name for name in self.names if sink.target.read(self._done(name)) is None]
+        for name, place in self._fetched(todo):
+            if isinstance(place, CarlascError):
+                yield Failure(name, -1, str(place))
+                continue
+            try:
+                result = self._convert(name, place, sink, run)
+            except StorageError:
+                raise
+            except (CarlascError, OSError) as error:
+                yield Failure(name, -1, str(error).replace(str(place), without_credentials(name)))
+                continue
+            if not result.failures:
+                sink.target.put(self._done(name), to_json({"clip": without_credentials(name)}))
+            yield result
+
+    def _done(self, name: str) -> str:
+        """Return the file that says that a clip is done with these arguments."""
+        return f"{layout.DERIVED}/clips/{combined(name, repr(self.arguments))}.json"
+
+    def _convert(self, name: str, place: Path, sink: FolderSink, run: Run) -> Any:
+        given, record = {**self.arguments}, layout.record_file("clip")
+        name = without_credentials(name)
+        for one in find_recordings(open_converter(given["name"], place, given["options"])):
+            writer = sink.sequence(sequence_path(one))
+            if not writer.create_document(record, name.encode()):
+                before = (writer.read_document(record) or b"").decode()
+                if before != name:
+                    raise ConflictError(writer.location, expected=f"only {name}", found=before)
+        if place.is_relative_to(self.scratch):  # the times of its files mean nothing
+            given["layout"] = replace(given["layout"], compare_inputs="never")
+        return self.convert(source=place, out=self.out, run=run, **given)
+
+    def _fetched(self, names: Iterable[str]) -> Iterator[tuple[str, Path | CarlascError]]:
+        """Yield the place of each clip on this machine, or why it cannot be fetched. It is deleted
+        before the next one is yielded.
+        """
+        with ThreadPoolExecutor(1) as pool:
+            ahead = None
+            for name, later in pairwise([*names, ""]):
+                found = None if ahead is None else ahead.result()
+                place, held = found or self._fetch(name, self.most) or (Path(), 0)
+                ahead = pool.submit(self._fetch, later, self.most - held) if later else None
+                yield name, place
+                shutil.rmtree(self.scratch / combined(name), ignore_errors=True)
+
+    def _fetch(self, name: str, room: int) -> tuple[Path | CarlascError, int] | None:
+        """Return the place and the size of a clip, which is fetched if it is at a URL; None if it
+        needs more room.
+        """
+        alone = is_url(name) or Path(name).is_absolute()
+        url = name if alone else f"{self.source.rstrip('/')}/{name}"
+        if not is_url(url):
+            return Path(url), 0
+        try:
+            tree = RemoteTree(url)
+            sizes = tree.sizes()
+            if not sizes:
+                raise MissingDataError(tree.location, expected="a clip", found="nothing")
+            total = sum(sizes.values())
+            if total > self.most:
+                expected = f"at most {self.most} bytes, the size of the scratch"
+                raise CarlascError(tree.location, expected=expected, found=str(total))
+            if total > room:
+                return None
+            place = self.scratch / combined(name) / tree.location.rpartition("/")[2]
+            with writing(place):
+                for path, size in sizes.items():
+                    (place / path).parent.mkdir(parents=True, exist_ok=True)
+                    with (place / path).open("wb") as file:
+                        for at in range(0, size, _BLOCK):
+                            file.write(tree.read_range(path, at, min(at + _BLOCK, size)))
+        except StorageError:
+            raise
+        except CarlascError as error:
+            return error, 0
+        return place, total
+
+
+def convert_clips(
+    convert: Callable[..., Any],
+    source: AnyPath,
+    out: AnyPath,
+    arguments: Mapping[str, Any],
+    scratch: str,
+    run: Run,
+) -> list[Any]:
+    """Convert the clips of the list of a run, and return what `Clips.run` yields.
+
+    On a cluster, each clip is a task.
+
+    Raises:
+        ArgumentError: the scratch is no size, the output is a store, or another run has the same
+            scratch.
+    """
+    size = re.fullmatch(r"([0-9.]+) *([KMGT]?)B?", scratch.strip().upper())
+    if size is None:
+        raise ArgumentError("scratch", expected="a size, such as 20GB", found=scratch)
+    if str(out).endswith(PACKED):
+        raise ArgumentError("out", expected="a folder for a list of clips", found=str(out))
+    most = int(float(size[1]) * _UNITS[size[2]])
+    names, part = run.part.share(read_list(run, lambda: sorted(tree_of(source).entries())))
+    folder = Path(tempfile.gettempdir()) / f"carlasc-{combined(str(out), str(run.part))}"
+    clips = Clips(
+        tuple(names if part.number == 1 else ()),
+        os.fspath(source),
+        out,
+        convert,
+        arguments,
+        folder,
+        most,
+    )
+    steps = StepCounter(run.progress, len(clips.names))
+    run, results = replace(run, part=Part(), sequences_from=None, progress=None), list[Any]()
+    if run.executor is not None:
+        one = max(most // run.processes, 1)
+        tasks = (replace(clips, names=(name,), most=one) for name in clips.names)
+        for done in run_all(_run_one, tasks, run, lost=_fail):
+            results += done
+            steps()
+        return results
+    try:
+        with FileLock(f"{folder}.lock", timeout=0), one_pool(run) as pool:
+            shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed
+            for result in clips.run(pool):
+                results.append(result)
+                steps()
+            shutil.rmtree(folder, ignore_errors=True)
+    except Timeout:
+        advice = "wait for it, or set TMPDIR to another folder"
+        raise ArgumentError(folder, expected="no other run", found="one", advice=advice) from None
+    return results
+
+
+def _run_one(clips: Clips) -> list[Any]:
+    return list(clips.run())
+
+
+def _fail(clips: Clips, message: str) -> list[Any]:
+    return [Failure(clips.names[0], -1, message)]
