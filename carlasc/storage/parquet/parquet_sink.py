@@ -51,7 +51,7 @@ from carlasc.storage.parquet.table_columns import (
     statistics,
 )
 
-# level of Zstandard: from 11, points take 2 % less space; above 12, it takes several times as long
+# level of Zstandard: from 11, points take 2% less space; above 12, it takes several times as long
 _LEVEL = 12
 _PAGE = 8 << 20  # bytes: one page holds one column of a scan
 

@@ -217,10 +217,15 @@ def line(rows: dict[str, dict[str, Any]]) -> str:
     found = sum(len(row["found"]) for row in rows.values())
     result = f"{found} faults found" if found else "no torn file, no lost frame"
     kills = rows.get("kills", {}).get("tried", 0)
-    # None of n independent tries failed: with a confidence of 95 %, fewer than 3 / n of all do.
+    # None of n independent tries failed: with a confidence of 95%, fewer than 3 / n of all do.
     bound = (
-        f" (of kills, at most {3 / kills:.1%} can do harm, with a confidence of 95 %)"
+        f" The share of kills with a fault is below {3 / kills:.1%} with a confidence of 95%."
         if kills and not found
         else ""
     )
-    return f"**Reliability**, tried on small data of two frames: {listed}, {result}{bound}. [Figures and promises](docs/reliability.md)."
+    dates = sorted(row["date"] for row in rows.values())
+    days = " to ".join(dict.fromkeys([dates[0], dates[-1]]))
+    return (
+        f"**Reliability**, tested with data of two frames ({days}): {listed}; {result}.{bound} "
+        "[Figures and promises](docs/reliability.md)."
+    )
