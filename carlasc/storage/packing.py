@@ -191,9 +191,9 @@ def _pack_blocks(share: Share, sequences: Mapping[str, Sequence], sink: ZarrSink
             sink.sequence(path).is_complete() for path in paths
         ):
             return False  # another part finishes the store
+    sink.finish()
     for writer in writers if run.part.count == 1 else ():
         writer.remove_document(record_of(run.part))
-    sink.finish()
     return True
 
 
