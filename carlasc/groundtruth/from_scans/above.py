@@ -11,7 +11,7 @@ from carlasc.core.arrays import BoolArray, IntArray
 from carlasc.core.cells import joined
 from carlasc.core.grids import GridSpec
 
-_REACH_M = 1.2  # height of the space above a body that is taken for free; fact: above-reach
+_REACH_M = 1.2  # height of the space above a body that is taken for free
 
 
 def find_above(solid: BoolArray, known: BoolArray, bodies: BoolArray, spec: GridSpec) -> IntArray:
