@@ -34,10 +34,9 @@ from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Part, Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.files import AnyPath, to_json, writing
-from carlasc.storage.folder import FolderSink
+from carlasc.storage.folder import FolderSink, FolderWriter
 from carlasc.storage.inputs import combined, folder_states
 from carlasc.storage.opening import PACKED
-from carlasc.storage.protocol import SequenceWriter
 from carlasc.storage.shares import read_list
 from carlasc.storage.transport.remote_tree import RemoteTree, tree_of
 from carlasc.storage.transport.trees import is_url
@@ -114,7 +113,7 @@ class Clips:
 
     def _convert(self, name: str, state: str, place: Path, sink: FolderSink, run: Run) -> Any:
         given, record = {**self.arguments}, layout.record_file("clip")
-        name, writers, changed = without_credentials(name), list[SequenceWriter](), False
+        name, writers, changed = without_credentials(name), list[FolderWriter](), False
         mine = f"{name}\n{state}".encode()
         for one in find_recordings(open_converter(given["name"], place, given["options"])):
             writers.append(writer := sink.sequence(sequence_path(one)))
