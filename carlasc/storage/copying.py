@@ -244,7 +244,8 @@ def unpack(
         What was written.
 
     Raises:
-        ConflictError: something exists at `out`, or `out` lies inside `source`.
+        ConflictError: something exists at `out`, `out` lies inside `source`, or `source` changed
+            since an earlier run.
         FormatError, MissingDataError: a part of the source is damaged or missing.
         StorageError: the files cannot be written: a full disk, a folder without write permission.
     """
