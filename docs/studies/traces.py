@@ -69,6 +69,7 @@ def main() -> None:
             viewpoint=Viewpoint.parse("elevation=44 distance=53 target=0,0,-1.8"),
             legend=colors.entries([CARLA.id_of(name) for name in SHORT]),
             captioned=True,
+            font_size=24,
         )
         out = (
             given.work if study.is_tiny() else Path(__file__).parents[1] / "images"
