@@ -105,7 +105,7 @@ def test_every_requirement_has_a_lowest_version():
 
 
 FOR_DEVELOPERS, SETS = {"dev", "docs", "study", "faults"}, {"all", "demo", "train", "convert"}
-HEAVY = {"torch", "view", "rerun", "carla"}  # gigabytes, and carla has few wheels
+HEAVY = {"torch", "view", "rerun", "ray", "carla"}  # large, and carla has few wheels
 
 
 def test_all_is_every_extra_but_sets_of_others_the_heavy_ones_and_those_of_developers():

@@ -12,9 +12,9 @@ import carlasc
 from carlasc.cli.common import (
     FAILED,
     MANY,
-    WORST,
     Json,
     SourceArgument,
+    few,
     print_json,
     report_failures,
     show,
@@ -135,21 +135,26 @@ def validate(
 
 def print_result(result: ValidationResult, *, everything: bool = False) -> None:
     """Print the findings by kind, errors first; `carlasc demo` uses it too."""
+    from carlasc.cli.tables import print_table
     from carlasc.inspection.findings import SEVERITIES, STATES
 
     for (severity, check), findings in result.grouped().items():
-        show(f"{severity}: {check} ({len(findings)})", _COLORS[severity])
+        about = f", in {result.sequences_with(findings).text(_whole)} sequences"
+        text = f"{severity}: {check} ({len(findings)}{about if result.places else ''})"
+        show(text, _COLORS[severity])
         shown = findings if everything else findings[:_SHOWN]
         for finding in shown:
             show(f"  {finding}")
         if len(findings) > len(shown):
             show(f"  ... and {len(findings) - len(shown)} more (--all prints them)")
-    reports, found = result.sequences, Counter(finding.sequence for finding in result.findings)
-    if len(reports) > MANY and not everything:
-        frames = sum(report.frames for report in reports)
-        show(f"{len(reports)} sequences, {count(frames, 'frame')}; those with most findings:")
-        reports = tuple(sorted(reports, key=lambda report: -found[report.path])[:WORST])
-    for report in reports:
+    found = Counter(finding.sequence for finding in result.findings)
+    if result.places or (len(result.sequences) > MANY and not everything):
+        if result.places:
+            show(f"a sample of {sum(result.places.values()):,} sequences")
+        splits = result.by_split()
+        rows = [[split, *sums.values()] for split, sums in splits.items()]
+        print_table(["sequences with", *next(iter(splits.values()))], rows, turn=False)
+    for report in few(result.sequences, lambda report: found[report.path], everything=everything):
         figures = [
             f"{share:.1%} of points in voxels of their class ({grid})"
             for grid, share in report.voxel_share.items()
@@ -177,6 +182,10 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
                 show(f"  {words}: {', '.join(own)}")
     counts = ", ".join(count(result.count(severity), severity) for severity in SEVERITIES)
     show(f"{result.location}: {result.verdict} ({counts})", "bold")
+
+
+def _whole(number: float) -> str:
+    return f"{number:,.0f}"
 
 
 def print_held_out(result: HoldoutResult) -> None:

@@ -120,6 +120,8 @@ class Figures:
         other = {
             "faults.table": faults.table(rows),
             "faults.commands": faults.commands(rows),
+            "faults.runs": faults.runs(rows, faults.known_code()),
+            "faults.large": faults.large(rows),
             "faults.line": faults.line(rows),
             "figures.machine": self._machine(),
         }
