@@ -426,7 +426,11 @@ def figures():
     return figures
 
 
-@pytest.mark.parametrize("name", ["frames.svg", "votes.svg"])
+@pytest.mark.parametrize(
+    "name",
+    ["frames.svg", "votes.svg", "steps.svg", "../assets/logo.svg"],
+    ids=lambda name: name[-9:],
+)
 def test_drawings_are_those_that_the_script_draws(name, figures):
     if (
         f"matplotlib=={version('matplotlib')}"
