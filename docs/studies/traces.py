@@ -37,7 +37,7 @@ COLORS = {
     "Pole": (90, 90, 90), "TrafficSign": (90, 90, 90), "TrafficLight": (90, 90, 90),
     "Static": (150, 140, 130),
 }  # fmt: skip
-QUIET = replace(CARLA, colors=CARLA.colors | {CARLA.id_of(n): c for n, c in COLORS.items()})
+QUIET = replace(CARLA, colors={**CARLA.colors, **{CARLA.id_of(n): c for n, c in COLORS.items()}})
 SHORT = ("Vehicle", "Pedestrian", "Road", "Sidewalk", "Building", "Terrain")  # of the legend
 
 
