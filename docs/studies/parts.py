@@ -30,30 +30,34 @@ CALLS = "trace=file,fsync,fdatasync"
 GRID = GridSpec.published().with_size((16, 16, 4))
 COMMANDS = {
     "regrid": "{folder}/in -o {out} --size 16,16,4 --workers 1",
-    "refine": "{folder}/in -o {out} --workers 1",
-    "label": "{folder}/in -o {out} --from motion --workers 1",
-    "pack": "{folder}/in {out}.zarr --workers 1",
-    "export": "kitti {folder}/in {out} --workers 1",
-    "audit": "{folder}/in {folder}/in --keep {out} --workers 1",
+    "regrid labelled": "{folder}/labelled -o {out} --size 16,16,4 --workers 1",
+    "refine": "{folder}/labelled -o {out} --workers 1",
+    "label": "{folder}/labelled -o {out} --from motion --workers 1",
+    "pack": "{folder}/labelled {out}.zarr --workers 1",
+    "export": "kitti {folder}/labelled {out} --workers 1",
+    "audit": "{folder}/labelled {folder}/labelled --keep {out} --workers 1",
     "convert": "ncore {folder}/clips {out} --grids none --sequences-from {folder}/list --workers 1",
 }
 
 
 def write_sequences(folder: Path, count: int) -> None:
-    """Write sequences of ten small scans and grids, without waiting for the disk."""
+    """Write sequences of ten small scans, without waiting for the disk; in a folder "labelled" also
+    labels and grids.
+    """
     os.environ["CARLASC_DURABLE"] = "no"
     random = np.random.default_rng(0)
     points = random.uniform(-20, 20, (200, 4)).astype(np.float32)
     labels = random.integers(0, 2, GRID.size, dtype=np.uint32)
     fields = {
-        "points": points,
         "labels": np.ones(200, np.uint32),
         "evaluation/labels": labels,
         "evaluation/counts": np.ones(GRID.size, np.float32),
     }
+    fields = {"points": points, **(fields if folder.name == "labelled" else {})}
     for index in range(len(list(folder.glob("Train/*"))), count):
         writer = FolderSink(folder).sequence(f"Train/clip_{index:06d}/cartesian")
-        writer.write_document("evaluation/params.json", json.dumps(GRID.to_params()).encode())
+        if len(fields) > 1:
+            writer.write_document("evaluation/params.json", json.dumps(GRID.to_params()).encode())
         writer.write_frames(dict.fromkeys(range(FRAMES), fields))
         poses = [f"1 0 0 {0.1 * frame:g} 0 1 0 0 0 0 1 0\n" for frame in range(FRAMES)]
         writer.write_document("poses.txt", "".join(poses).encode())
@@ -75,10 +79,10 @@ def measure(root: Path, count: int, command: str) -> None:
     parts = max(count, 1)
     number = next(n for n in range(1, 99) if len(Part(n, parts).share(names)[0]) == 1)
     own = Part(number, parts).share(names)[0][0].partition(".")[0]
-    log = root / f"calls-{command}{count}"
-    arguments = COMMANDS[command].format(folder=root, out=root / f"{command}{count}").split()
+    log, out = root / f"calls-{command}{count}", root / f"{command.replace(' ', '-')}{count}"
+    arguments = COMMANDS[command].format(folder=root, out=out).split()
     call = ["strace", "-f", "-o", str(log), "-e", CALLS, sys.executable, "-c"]
-    call += ["from carlasc.cli import main; main()", command, *arguments]
+    call += ["from carlasc.cli import main; main()", command.split()[0], *arguments]
     before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
     durable = {**os.environ, "CARLASC_DURABLE": "yes"}
     call += ["--part", f"{number}/{parts}"]
@@ -113,5 +117,7 @@ if __name__ == "__main__":
             write_clips(Path(place), sizes[-1])
             for sequences in sizes:
                 write_sequences(Path(place) / "in", sequences)
+                if sequences == sizes[-1]:
+                    write_sequences(Path(place) / "labelled", sequences)
                 for name in COMMANDS if sequences == sizes[-1] else ["regrid"]:
                     measure(Path(place), sequences, name)
