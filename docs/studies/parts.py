@@ -82,7 +82,7 @@ def measure(root: Path, count: int, command: str) -> None:
     log, out = root / f"calls-{command}{count}", root / f"{command.replace(' ', '-')}{count}"
     arguments = COMMANDS[command].format(folder=root, out=out).split()
     call = ["strace", "-f", "-o", str(log), "-e", CALLS, sys.executable, "-c"]
-    call += ["from carlasc.cli import main; main()", command.split()[0], *arguments]
+    call += ["from carlasc.cli import main; main()", command.partition(" ")[0], *arguments]
     before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
     durable = {**os.environ, "CARLASC_DURABLE": "yes"}
     call += ["--part", f"{number}/{parts}"]
