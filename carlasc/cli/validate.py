@@ -201,10 +201,10 @@ def print_held_out(result: HoldoutResult) -> None:
     for name, scores in result.given_poses.items():
         shares = scores.all
         figures = {"free": shares.free, "unknown": shares.unknown, "occupied": shares.occupied}
-        text = ", ".join(f"{100 * (share or 0):.2f} % {where}" for where, share in figures.items())
+        text = ", ".join(f"{100 * (share or 0):.2f}% {where}" for where, share in figures.items())
         show(
             f"{name or result.location}: under the given poses: returns in {text} voxels; "
-            f"{100 * (shares.passed_object or 0):.2f} % of the rays pass through objects"
+            f"{100 * (shares.passed_object or 0):.2f}% of the rays pass through objects"
         )
     for name, fault in result.faults.items():
         if fault:
@@ -225,7 +225,7 @@ def _print_scores(title: str, scores: HeldOutScores) -> None:
         "Passed objects %",
         "Missed %",
         "Error m",
-        "90 % m",
+        "90% m",
     ]
     parts = {"all": scores.all, **scores.by_distance(), **scores.by_class()}
     print_table(header, [_row(name, one) for name, one in parts.items()], title=title, turn=False)

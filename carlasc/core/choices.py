@@ -23,9 +23,6 @@ Dynamic = Literal["align", "current", "drop", "tube"]
 Complete = Literal["seen", "mirror", "body"]
 """Treatment of the parts of an actor that no scan saw."""
 
-Rays = Literal["all", "enough"]
-"""Which rays are traced when scans are merged."""
-
 PoseSource = Literal["auto", "file", "kiss-icp"]
 """Where the poses of scans come from."""
 

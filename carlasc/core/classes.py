@@ -15,7 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from carlasc.core.arrays import AnyIntArray, FloatArray, Int32Array, LabelArray, Uint8Array
-from carlasc.errors import ArgumentError, FormatError, check_types, first_names
+from carlasc.errors import ArgumentError, FormatError, check_types, first_names, within
 
 Color = tuple[int, int, int]
 ROLES = ("moving", "movable", "deformable", "ground")
@@ -285,7 +285,49 @@ class TableUse:
 
 
 BUILT_IN: dict[str, ClassTable] = {}
-"""The class tables of `carlasc.core.TABLES`, by name."""
+"""The class tables of `carlasc.core.TABLES`, by name; `carlasc.core.tables` makes them."""
+
+
+def table_named(name: str) -> ClassTable:
+    """Return the class table with a name in `TABLES`.
+
+    Raises:
+        FormatError: no table has this name.
+    """
+    if name not in BUILT_IN:
+        raise FormatError("classes", expected=f"one of {', '.join(BUILT_IN)}", found=repr(name))
+    return BUILT_IN[name]
+
+
+def table_from_json(value: object, where: str) -> ClassTable:
+    """Return the class table that a JSON file names or contains.
+
+    Args:
+        value: the name of a table in `TABLES`, or the result of `ClassTable.to_dict`.
+        where: the file, for errors.
+
+    Raises:
+        FormatError: no table has this name, the values are not valid, or a table in `TABLES` has
+            the same name and other values.
+    """
+    if not isinstance(value, Mapping):
+        with within(where):
+            return table_named(str(value))
+    table = ClassTable.from_dict(value, where)
+    known = BUILT_IN.get(table.name, table)
+    if known != table:
+        raise FormatError(
+            f"{where}: classes",
+            expected=f"a name that is not in use, or the table {table.name} of carlasc",
+            found=f"a different table with the name {table.name}",
+            advice="give the table a new name",
+        )
+    return known
+
+
+def table_to_json(table: ClassTable) -> str | dict[str, Any]:
+    """Return a class table for JSON: its name if it is in `TABLES`, otherwise the whole table."""
+    return table.name if BUILT_IN.get(table.name) == table else table.to_dict()
 
 
 def tables_with(ids: Collection[int], like: ClassTable) -> list[ClassTable]:

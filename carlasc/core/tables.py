@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
 from carlasc.core.arrays import LabelArray
 from carlasc.core.classes import BUILT_IN, ClassTable, Remap, color_of
+from carlasc.core.classes import table_from_json as table_from_json  # noqa: PLC0414 (part of it)
+from carlasc.core.classes import table_named as table_named  # noqa: PLC0414 (part of it)
+from carlasc.core.classes import table_to_json as table_to_json  # noqa: PLC0414 (part of it)
 from carlasc.errors import ArgumentError, FormatError, check_choice
 
 
@@ -386,45 +388,6 @@ TRAIN_VOXEL_COUNTS = np.array(
 """
 
 
-def table_named(name: str) -> ClassTable:
-    """Return the class table with a name in `TABLES`.
-
-    Raises:
-        FormatError: no table has this name.
-    """
-    if name not in TABLES:
-        raise FormatError("classes", expected=f"one of {', '.join(TABLES)}", found=repr(name))
-    return TABLES[name]
-
-
-def table_from_json(value: object, where: str) -> ClassTable:
-    """Return the class table that a JSON file names or contains.
-
-    Args:
-        value: the name of a table in `TABLES`, or the result of `ClassTable.to_dict`.
-        where: the file, for errors.
-
-    Raises:
-        FormatError: no table has this name, the values are not valid, or a table in `TABLES` has
-            the same name and other values.
-    """
-    if not isinstance(value, Mapping):
-        try:
-            return table_named(str(value))
-        except FormatError as error:
-            raise error.within(where) from error
-    table = ClassTable.from_dict(value, where)
-    known = TABLES.get(table.name)
-    if known is not None and known != table:
-        raise FormatError(
-            f"{where}: classes",
-            expected=f"a name that is not in use, or the table {table.name} of carlasc",
-            found=f"a different table with the name {table.name}",
-            advice="give the table a new name",
-        )
-    return table if known is None else known
-
-
 def classes_from(value: object, where: str) -> tuple[ClassTable, Remap | None]:
     """Return the class table of a file of classes, and its map from the ids of another table.
 
@@ -456,11 +419,6 @@ def classes_from(value: object, where: str) -> tuple[ClassTable, Remap | None]:
             expected='ids by ids, or a text such as "1->7 14..19->10"',
             found=str(error),
         ) from error
-
-
-def table_to_json(table: ClassTable) -> str | dict[str, Any]:
-    """Return a class table for JSON: its name if it is in `TABLES`, otherwise the whole table."""
-    return table.name if TABLES.get(table.name) == table else table.to_dict()
 
 
 def remap_named(name: str) -> Remap:

@@ -13,7 +13,6 @@ import numpy as np
 
 from carlasc.core.choices import Complete as Complete  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import Dynamic as Dynamic  # noqa: PLC0414 (part of this module)
-from carlasc.core.choices import Rays as Rays  # noqa: PLC0414 (part of this module)
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, check_choice, check_types
 from carlasc.groundtruth.voting.ballot import VoteRule, check_rule
@@ -51,9 +50,6 @@ class FromScans:
         motion: how moving points are found.
         poses: where poses come from. Missing poses are estimated from the scans, unless
             `PoseOptions("file")` is given.
-        rays: which rays of the scans of other frames vote. "all": every ray. "enough": near the
-            sensor, where rays are dense, one of up to four, with their weight; only for the rule
-            "ray".
         min_range_m: leave out nearer points, in metres. None: the range in carlasc.json, or 0.
         max_range_m: leave out farther points, in metres. None: the range in carlasc.json, or no
             limit.
@@ -70,7 +66,6 @@ class FromScans:
     own_path: bool = True
     motion: MotionOptions = MotionOptions()  # noqa: RUF009 (frozen)
     poses: PoseOptions = PoseOptions()  # noqa: RUF009 (frozen)
-    rays: Rays = "all"
     min_range_m: float | None = None
     max_range_m: float | None = None
 
@@ -91,7 +86,6 @@ class FromScans:
             )
         check_choice("dynamic", self.dynamic, Dynamic)
         check_choice("complete", self.complete, Complete)
-        check_choice("rays", self.rays, Rays)
         for name, options in (("motion", MotionOptions), ("poses", PoseOptions)):
             if not isinstance(value := getattr(self, name), options):
                 raise ArgumentError(name, expected=f"{options.__name__}(...)", found=repr(value))

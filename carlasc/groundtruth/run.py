@@ -69,11 +69,12 @@ from carlasc.storage.shares import Share, source_in
 from carlasc.storage.transport.remote_tree import check_shared
 from carlasc.storage.transport.trees import is_url
 
-RULES = {"capture": 1, "scans": 3, "grid": 1}
+RULES = {"capture": 1, "scans": 4, "grid": 1}
 """Version of the rule that makes grids, by what observes the scene.
 
 It changes only when the same input gives other grids.
 """
+_TOGETHER = 64  # number of frames that a worker makes one after another, about
 
 
 @dataclass(frozen=True)
@@ -340,7 +341,9 @@ def _begin(job: SequenceJob) -> None:
     writer, params = job.writer, layout.params_file(job.plan.grid)
     if job.replaces:
         writer.remove_grid(job.plan.grid)
-    if not writer.create_document(params, job.documents[params]):
+    if writer.create_document(params, job.documents[params]):
+        job.check.announce(job.numbers)
+    else:
         check_grid(writer, job.plan.grid, job.params, (), overwrite=False)
     for document, data in job.documents.items():
         if document != params:
@@ -465,16 +468,16 @@ class FrameTask:
 
 @dataclass(frozen=True)
 class Batch:
-    """Tasks that a worker runs one after another: the frames that are stored together, or the
-    measurement of one frame.
+    """Tasks that a worker runs one after another: frames that follow each other, or the measurement
+    of one frame.
 
     Attributes:
         writer: where the frames are written.
-        tasks: the tasks.
+        blocks: the tasks; those of frames that are stored together are in one tuple.
     """
 
     writer: SequenceWriter
-    tasks: tuple[FrameTask, ...]
+    blocks: tuple[tuple[FrameTask, ...], ...]
 
 
 def run_batch(batch: Batch) -> list[FrameResult]:
@@ -484,23 +487,26 @@ def run_batch(batch: Batch) -> list[FrameResult]:
         ConflictError: a scan exists already, and differs from that of this run.
         StorageError: nothing can be written, so all other batches would fail too.
     """
-    done: list[FrameResult] = []
-    for task in batch.tasks:  # in Python 3.11, a comprehension is a level of calls
-        done.append(task.run())  # noqa: PERF401
-    if not batch.writer.concurrent:
-        return done
-    try:
-        write_frames(batch.writer, done)
-    except (ConflictError, StorageError):
-        raise  # every other batch would raise the same
-    except (CarlascError, OSError) as error:
-        done = [replace(result, error=result.error or str(error), facts=None) for result in done]
-    return [replace(result, outputs={}) for result in done]
+    every: list[FrameResult] = []
+    for tasks in batch.blocks:
+        done: list[FrameResult] = []
+        for task in tasks:  # in Python 3.11, a comprehension is a level of calls
+            done.append(task.run())  # noqa: PERF401
+        if batch.writer.concurrent:
+            try:
+                write_frames(batch.writer, done)
+            except (ConflictError, StorageError):
+                raise  # every other batch would raise the same
+            except (CarlascError, OSError) as error:
+                done = [replace(one, error=one.error or str(error), facts=None) for one in done]
+            done = [replace(one, outputs={}) for one in done]
+        every += done
+    return every
 
 
 def fail_batch(batch: Batch, message: str) -> list[FrameResult]:
     """Return the result of a batch that no worker could finish."""
-    return [FrameResult(task, error=message) for task in batch.tasks]
+    return [FrameResult(task, error=message) for tasks in batch.blocks for task in tasks]
 
 
 def write_frames(writer: SequenceWriter, results: Series[FrameResult]) -> None:
@@ -721,7 +727,7 @@ class Work:
                 if missing:
                     job.inputs.prepare(job.writer, self.spread, steps)
                     job.check.begin(job.numbers, todo)
-                for batch in _batches(job, job.tasks(missing)):
+                for batch in _batches(job, job.tasks(missing), self.spread):
                     under_way.append(job)
                     yield batch
 
@@ -769,12 +775,22 @@ class Work:
         """Write the report of a sequence."""
         job.inputs.prepare(job.writer, self.spread, StepCounter(None))
         self.has_written = True
-        measured = _batches(job, job.tasks(job.reported - tried, job.writer))
+        measured = _batches(job, job.tasks(job.reported - tried, job.writer), Run(1))
         with closing(run_all(run_batch, measured, self.spread, lost=fail_batch)) as results:
             job.write_report([*made, *(done for batch in results for done in batch)])
 
 
-def _batches(job: SequenceJob, tasks: Series[FrameTask]) -> Iterator[Batch]:
-    """Yield tasks in batches; the frames that are stored together are in one batch."""
-    for _, group in groupby(tasks, key=lambda task: job.block_of(task.number)):
-        yield Batch(job.writer, tuple(group))
+def _batches(job: SequenceJob, tasks: Series[FrameTask], spread: Run) -> Iterator[Batch]:
+    """Yield tasks in batches.
+
+    Frames from scans share the scans of their windows: each worker makes frames that follow each
+    other, as long as it writes them itself.
+    """
+    groups = groupby(tasks, key=lambda task: job.block_of(task.number))
+    blocks, together = [tuple(group) for _, group in groups], 1
+    shares = isinstance(job.plan.observe, FromScans) and job.writer.concurrent
+    if shares and not spread.is_alone:
+        rounds = max(round(len(tasks) / (_TOGETHER * spread.processes)), 1)
+        together = max(-(-len(blocks) // (rounds * spread.processes)), 1)
+    for begin in range(0, len(blocks), together):
+        yield Batch(job.writer, tuple(blocks[begin : begin + together]))

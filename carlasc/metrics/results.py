@@ -371,7 +371,7 @@ def _percent(*values: float) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class Interval:
-    """A confidence interval of 95 %.
+    """A confidence interval of 95%.
 
     Attributes:
         value: the score over all sequences.

@@ -1,94 +1,75 @@
-"""What a part of the rays costs in scores: `python docs/studies/rays.py [WORK]`.
+"""What following each ray once, into cells, changes: `python docs/studies/rays.py [WORK] [--before
+FILE]`.
 
-The drives of `movers.py` are merged with all rays and with `rays="enough"`, and both are compared
-with what other sensors saw at the same instant. Prints a line for each drive and grid, then the
-differences of the scores over all drives, in points, and of held-out rays. WORK keeps drives and
-references.
+The drives of `movers.py` are merged and compared with what other sensors saw at the same instant.
+The figures are written to WORK/rays.json. FILE has those of another version of carlasc: with it,
+the differences are printed, in points. WORK keeps drives, references and actors.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
-from dataclasses import replace
-from functools import reduce
-from operator import add
+import json
+import time
+from pathlib import Path
 
+import numpy as np
 import study
 from movers import BY_NAME, SEEDS, ActorStore, judge
-from movers_drives import GRIDS, record, reference
+from movers_drives import GRIDS, Recorded, record, reference
 from movers_rows import Row
-from movers_scores import Counts, figures
+from movers_scores import figures
 
-from carlasc import Run
-from carlasc.groundtruth.options import Rays
-from carlasc.inspection import holdout
+from carlasc import Voting
+from carlasc.core.frames import FrameRange
+from carlasc.groundtruth.from_scans.feed import ScanFeed
+from carlasc.groundtruth.from_scans.frame import merge_frame
+from carlasc.groundtruth.inputs import GridPlan
 
-CHANNELS = (64, 16)
-WAYS: tuple[Rays, ...] = ("all", "enough")
-HELD_OUT = 2  # drives whose held-out rays are followed too
+CHANNELS = (64,)
+WARM, TIMED = 2, 10  # numbers of consecutive frames: before the clock starts, and with it
 
 
 def main() -> None:
-    """Make the grids of each drive in both ways, and print what differs."""
-    found: dict[tuple[str, int, str], list[Counts]] = defaultdict(list)
-    with study.begin(study.options(__doc__, SEEDS)) as given:
-        settings = [
-            (drive, channels)
-            for drive in study.drives(given, SEEDS)
-            for channels in study.few(CHANNELS)
-        ]
-        for number, ((kind, seed), channels) in enumerate(settings):
-            (drive,) = record(kind, seed, [channels], given.work)
-            references = reference(kind, seed, given.work)
-            name = str(drive.setting)
-            store, base = (
-                ActorStore(given.work / "scores" / name / "actors"),
-                BY_NAME["align, evidence"],
-            )
-            store.folder.mkdir(parents=True, exist_ok=True)
-            for grid in GRIDS:
-                chosen = {
-                    frame: seen for (other, frame), seen in references.items() if other == grid
-                }
-                for rays in WAYS:
-                    row = Row(rays, replace(base.observe, rays=rays))
-                    found[grid, channels, rays].append(judge(drive, row, grid, chosen, store))
-                print(
-                    name,
-                    grid,
-                    _differences(*(found[grid, channels, rays][-1] for rays in WAYS)),
-                    flush=True,
-                )
-            for rays in WAYS if number < HELD_OUT and not study.is_tiny() else ():
-                observe = replace(base.observe, rays=rays)
-                scores = holdout(
-                    drive.folder, observe=observe, every=15, frames=(30, 61), run=Run(workers=1)
-                )
-                print(name, rays, "held-out rays", scores.to_dict()["total"], flush=True)
-    for grid, channels in dict.fromkeys((grid, channels) for grid, channels, _ in found):
-        totals = [reduce(add, found[grid, channels, rays]) for rays in WAYS]
-        print(
-            f"\n{grid}, {channels} channels, {len(found[grid, channels, 'all'])} drives: "
-            f"{_differences(*totals)}"
-        )
+    """Make the grids of each drive, and print their figures, or what differs."""
+    parser = study.options(__doc__, SEEDS)
+    parser.add_argument("--before", type=Path, help="figures of another version")
+    with study.begin(parser) as given:
+        before = json.loads(given.before.read_text()) if given.before else {}
+        found: dict[str, dict[str, float]] = {}
+        row = BY_NAME["align, evidence"]
+        for kind, seed in study.drives(given, SEEDS):
+            for drive in record(kind, seed, CHANNELS, given.work):
+                references = reference(kind, seed, given.work)
+                store = ActorStore(given.work / "scores" / str(drive.setting) / "actors")
+                store.folder.mkdir(parents=True, exist_ok=True)
+                for grid in GRIDS:
+                    seen = {f: one for (other, f), one in references.items() if other == grid}
+                    scores = figures(judge(drive, row, grid, seen, store))
+                    scores["seconds"] = _seconds(drive, row, grid, min(seen), store)
+                    name = f"{drive.setting} {grid}"
+                    found[name], old = scores, before.get(name, {})
+                    shown = (
+                        f"{key} {old[key]:.3f} -> {value:.3f}"
+                        if key == "seconds" or key.startswith("wrongly")
+                        else f"{key} {100 * (value - old[key]):+.2f}"
+                        for key, value in scores.items()
+                        if key in old
+                    )
+                    print(name, ", ".join(shown) or scores, flush=True)
+        (given.work / "rays.json").write_text(json.dumps(found))
 
 
-def _differences(one: Counts, other: Counts) -> str:
-    """Return the differences of all scores, in points, and the ratio of the times."""
-    before, after = figures(one), figures(other)
-    shown = [
-        f"{name} {100 * (after[name] - value):+.2f}"
-        for name, value in before.items()
-        if not name.startswith(("wrongly", "seconds"))
-    ]
-    counts = [
-        f"{name} {value:.0f} -> {after[name]:.0f}"
-        for name, value in before.items()
-        if name.startswith("wrongly")
-    ]
-    return ", ".join(
-        [*shown, *counts, f"seconds {before['seconds']:.2f} -> {after['seconds']:.2f}"]
-    )
+def _seconds(drive: Recorded, row: Row, grid: str, first: int, store: ActorStore) -> float:
+    """Return the median CPU time of consecutive frames, in seconds per frame."""
+    feed = ScanFeed(drive.sequence, row.observe)
+    actors = store.of(row, feed)
+    plan = GridPlan(GRIDS[grid], "grid", row.observe, Voting(), FrameRange())
+    times = []
+    for frame in feed.frames[feed.frames >= first][: WARM + TIMED].tolist():
+        start = time.process_time()
+        merge_frame(plan, feed, actors, frame, feed.reaching(frame, plan.spec))
+        times.append(time.process_time() - start)
+    return float(np.median(times[WARM:]))
 
 
 if __name__ == "__main__":

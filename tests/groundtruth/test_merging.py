@@ -17,7 +17,7 @@ from carlasc.groundtruth.from_scans.merging import (
     Merger,
     PreparedScan,
 )
-from carlasc.groundtruth.voting.ballot import NOWHERE
+from carlasc.groundtruth.voting.ballot import Ballot
 from carlasc.motion import Extent, Track
 from carlasc.motion.tracks import MovingActors
 from carlasc.storage import FolderSink, FolderSource, layout
@@ -83,60 +83,62 @@ def regions_of(merging, frame=15):
     return BodyRegions.at(merging, instant(frame), FRAMES, SPEC)
 
 
-def observe(merging, frame=15, window=FRAMES):
-    """Return the observations of the static scene and of the actor."""
+def classes(merging, other, frame=15):
+    """Return the classes of the points of a scan that vote on a frame."""
+    return [label for label, *_ in merging.points(instant(frame), [other])]
+
+
+def in_bodies(merging, frame=15, window=FRAMES, **options):
+    """Return the class of the points in the body of the actor, and the points of each scan."""
     now = instant(frame)
-    bodies = BodyRegions.at(merging, now, window, SPEC).actors
-    in_bodies = each_voter(merging.in_bodies(now, window, bodies))
-    return list(merging.observations(now, window)), in_bodies
-
-
-def each_voter(observations):
-    """Return the observations of each voter apart."""
-    return [
-        replace(
-            one,
-            points=one.points[a:b],
-            labels=one.labels[a:b],
-            hits=one.hits[a:b],
-            grid_T_sensor=pose,
-            ends=None,
-        )
-        for one in observations
-        for pose, a, b in zip(one.grid_T_sensor, [0, *one.ends[:-1]], one.ends, strict=True)
+    seen = [
+        one.points for one in merging.bodies(now, window, regions_of(merging, frame), **options)
     ]
+    return [(label, one) for label, points, *_ in seen for one in points]
+
+
+def in_world(one, frame=15):
+    return transform_points(sensor_pose(frame) @ one.grid_T_points, one.points.T)
 
 
 def test_a_persons_shape_is_used_for_eight_frames_and_a_vehicles_for_all():
     assert PEDESTRIAN in CARLA.deformable and VEHICLE not in CARLA.deformable
-    assert len(observe(merger(PEDESTRIAN))[1]) == 16
-    assert len(observe(merger(PEDESTRIAN), frame=2)[1]) == 2 + 8
-    assert len(observe(merger(VEHICLE))[1]) == 30
+    assert len(in_bodies(merger(PEDESTRIAN))) == 16
+    assert len(in_bodies(merger(PEDESTRIAN), frame=2)) == 2 + 8
+    assert len(in_bodies(merger(VEHICLE))) == 30
 
 
-def test_an_actors_points_are_carried_to_where_it_is_and_vote_in_its_box_only():
-    _, actor = observe(merger())
-    for observation in actor:
-        assert observation.hit_region == observation.free_region == 1
-        hit = observation.points[observation.hits]
-        place = transform_points(observation.grid_T_sensor, hit)
-        truth = transform_points(invert(sensor_pose(15)), actor_pose(15)[None, :3, 3])
-        assert np.abs(place[np.argmin(np.linalg.norm(place - truth, axis=1))] - truth).max() < 1e-5
+def test_an_actors_points_are_carried_to_where_it_is():
+    for label, points in in_bodies(merger()):
+        assert label == VEHICLE
+        assert np.abs(in_world(points) - actor_pose(15)[:3, 3]).max() < 1e-5
+
+
+def test_points_of_an_actor_outside_of_its_region_do_not_vote():
+    merging, now = merger(), instant(15)
+    regions = regions_of(merging)
+    none = replace(regions, of_voxel=np.where(regions.of_voxel == 1, 2, 0).astype(np.uint16))
+    votes = []
+    for one in (regions, none):
+        ballot = Ballot(SPEC, rule="ray")
+        ballot.add_points(body.points for body in merging.bodies(now, FRAMES, one))
+        votes.append(ballot.votes().occupied)
+    assert votes[0]["votes"].sum() == 30 and not len(votes[1])
 
 
 def test_rays_that_miss_the_box_are_not_carried():
-    _, actor = observe(merger())
-    labels = np.concatenate([observation.labels for observation in actor])
-    assert (labels != ROAD).all()
-    assert set(labels.tolist()) == {VEHICLE, 1}
+    merging = merger()
+    (body,) = merging.bodies(instant(15), FRAMES, regions_of(merging))
+    assert list(body.casts) == [frame for frame in FRAMES if frame != 15]
+    for frame, cast in body.casts.items():
+        ends = transform_points(cast.map_T_places[0], cast.points)
+        wall = actor_pose(frame)[:3, 3]  # it is as far behind the actor as the sensor is before it
+        assert np.abs(ends - np.array([np.zeros(3), wall])).max() < 1e-5
 
 
-def test_the_frames_own_rays_count_everywhere_those_of_others_outside_the_actors():
-    static, _ = observe(merger())
-    assert [observation.free_region for observation in static] == [
-        None if f == 15 else STATIC for f in FRAMES
-    ]
-    assert all(observation.hit_region is None for observation in static)
+def test_the_frames_own_rays_are_an_observation():
+    merging = merger()
+    assert sorted(merging.own(instant(15)).labels.tolist()) == classes(merging, 15)
 
 
 @pytest.mark.parametrize(
@@ -149,10 +151,10 @@ def test_the_frames_own_rays_count_everywhere_those_of_others_outside_the_actors
     ],
 )
 def test_which_moving_points_vote(dynamic, own, others):
-    static, _ = observe(merger(dynamic=dynamic))
-    for frame, observation in zip(FRAMES, static, strict=True):
-        votes = np.ones(3, bool) if observation.hits is None else observation.hits
-        assert votes.tolist() == [True, own if frame == 15 else others, True]
+    for frame in FRAMES:
+        moves = own if frame == 15 else others
+        expected = [1, ROAD, *([VEHICLE] if moves else [])]
+        assert classes(merger(dynamic=dynamic), frame) == sorted(expected)
 
 
 def test_points_of_a_track_that_were_not_known_to_move_are_left_out_too():
@@ -180,10 +182,7 @@ def test_points_of_a_track_that_were_not_known_to_move_are_left_out_too():
 def test_points_on_the_recording_vehicle_are_left_out_of_every_frame():
     merging = merger(tracks=[])
     merging.actors = MovingActors(own=(np.array([2.0, 7.0, -2.0, 4.0, 9.0, -1.0]),))
-    now = instant(15)
-    for other in (3, 15):
-        (seen,) = merging.observations(now, [other])
-        assert seen.hits.tolist() == [False, other == 15, True]
+    assert classes(merging, 3) == [1] and classes(merging, 15) == sorted([1, VEHICLE])
 
 
 def test_a_track_that_never_moves_is_part_of_the_static_scene():
@@ -229,11 +228,7 @@ def test_moving_points_without_a_body_have_a_region_in_which_the_frames_own_rays
     place = transform_points(invert(sensor_pose(15)), actor_pose(15)[None, :3, 3])
     assert not regions.actors
     assert np.flatnonzero(regions.of_voxel != STATIC).tolist() == SPEC.flat_index(place).tolist()
-    static, actors = observe(merging)
-    assert not actors
-    assert [one.free_region for one in static] == [
-        None if frame == 15 else STATIC for frame in FRAMES
-    ]
+    assert not in_bodies(merging)
 
 
 @pytest.mark.parametrize("dynamic", ["drop", "tube"])
@@ -252,32 +247,21 @@ def test_a_frame_without_its_own_scan_has_bodies_and_no_points():
 def test_the_mirror_image_of_an_actor_has_its_points_on_the_other_side():
     merging = merger()
     merging.scan_of(20).points[1] += np.float32([0.0, 0.3, 0.1])
-    now = instant(15)
-    for mirrored, plain in zip(
-        each_voter(merging.in_bodies(now, [20], regions_of(merging).actors, mirror=True)),
-        observe(merging, window=[20])[1],
-        strict=True,
-    ):
-        actor_T_grid = invert(invert(sensor_pose(15)) @ actor_pose(15))
-        one = transform_points(actor_T_grid @ plain.grid_T_sensor, plain.points)
-        other = transform_points(actor_T_grid @ mirrored.grid_T_sensor, mirrored.points)
-        assert np.abs(one * [1, -1, 1] - other).max() < 1e-5
-        assert mirrored.hit_region == mirrored.free_region == 1
-    assert not list(
-        merger(PEDESTRIAN).in_bodies(
-            now, FRAMES, regions_of(merger(PEDESTRIAN)).actors, mirror=True
-        )
+    ((_, plain),) = in_bodies(merging, window=[20])
+    ((label, mirrored),) = in_bodies(merging, window=[20], mirror=True)
+    one, other = (
+        transform_points(invert(actor_pose(15)), in_world(one)) for one in (plain, mirrored)
     )
+    assert np.abs(one).max() > 0.2 and np.abs(one * [1, -1, 1] - other).max() < 1e-5
+    assert label == VEHICLE
+    assert not in_bodies(merger(PEDESTRIAN), mirror=True)
 
 
-def test_what_passes_is_where_it_was_seen_and_frees_nothing():
-    now = instant(15)
-    passing = list(merger().moving(now, [frame for frame in FRAMES if frame != 15]))
-    assert len(passing) == 30
-    for frame, one in zip([f for f in FRAMES if f != 15], passing, strict=True):
-        assert one.free_region == NOWHERE and one.labels.tolist() == [VEHICLE]
-        place = transform_points(sensor_pose(15) @ one.grid_T_sensor, one.points)
-        assert np.abs(place - actor_pose(frame)[:3, 3]).max() < 1e-5
+def test_what_passes_is_where_it_was_seen():
+    merging = merger()
+    for frame in FRAMES:
+        passing = transform_points(sensor_pose(frame), merging.moving(frame))
+        assert np.abs(passing - actor_pose(frame)[:3, 3]).max() < 1e-5
 
 
 def test_the_scans_of_an_instant_are_those_within_a_quarter_of_a_second():
@@ -415,47 +399,3 @@ def test_all_points_of_an_actor_vote_for_its_class():
         PEDESTRIAN,
         1,
     ]
-
-
-def dense_scan(frame, count=40_000):
-    rng = np.random.default_rng(7)
-    directions = rng.normal(size=(count, 3)) * (1, 1, 0.1)
-    points = (
-        directions / np.linalg.norm(directions, axis=1)[:, None] * rng.uniform(2, 50, (count, 1))
-    )
-    return PreparedScan.of(frame, points.astype(np.float32), np.ones(count, np.uint16), np.eye(4))
-
-
-def test_enough_rays_are_a_part_of_those_near_the_sensor_and_count_for_all():
-    one = dense_scan(3)
-    chosen, weights = one.enough
-    distance = np.linalg.norm(one.points, axis=1)
-    assert len(chosen) < 0.95 * len(distance)
-    assert np.array_equal(
-        chosen[weights == 1], np.flatnonzero(distance > np.sqrt(len(distance) * 0.004 / 2))
-    )
-    near = distance <= np.sqrt(len(distance) * 0.004 / 4)
-    assert (weights[near[chosen]] == 4).all() and near[chosen].sum() == pytest.approx(
-        near.sum() / 4, rel=0.02
-    )
-    assert int(weights.sum()) == pytest.approx(len(distance), rel=0.01)
-
-
-def test_which_rays_are_enough_depends_on_frame_and_ray_alone():
-    chosen = dense_scan(3).enough[0]
-    assert np.array_equal(chosen, dense_scan(3).enough[0])
-    others = dense_scan(4).enough[0]
-    assert not np.array_equal(chosen, others)
-
-
-@pytest.mark.parametrize("rays", ["all", "enough"])
-def test_the_frames_own_rays_all_vote(rays):
-    scans = {frame: dense_scan(frame) for frame in (14, 15)}
-    merging = Merger(scans.__getitem__, MovingActors(), CARLA, "align")
-    merging.rays = rays
-    other, own = merging.observations(instant(15), (14, 15))
-    assert len(own) == 40_000 and own.weights is None
-    assert (len(other) < 40_000) == (rays == "enough")
-    if rays == "enough":
-        assert np.array_equal(other.points, scans[14].points[scans[14].enough[0]])
-        assert other.hits.shape == other.labels.shape == other.weights.shape

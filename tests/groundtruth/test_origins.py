@@ -94,7 +94,8 @@ def test_the_votes_of_a_scan_are_those_of_its_parts():
     scan = PreparedScan.of(0, points[order], labels[order], np.eye(4), origins=places[which][order])
     assert len(scan.rays) == 3 and sum(len(rays.points) for rays in scan.rays) == 4000
     together = count_votes(
-        [Observation(grid_T_sensor=scan.world_T_places, **scan.votes_of(scan.labels, None))], SPEC
+        [Observation(scan.ends, scan.labels, scan.world_T_places, scan.runs)],
+        SPEC,
     )
     expected = count_votes(
         [

@@ -16,13 +16,21 @@ from uuid import uuid4
 
 import numpy as np
 
-from carlasc.core.arrays import AnyArray, BoolArray, Float32Array, IntArray, LabelArray
-from carlasc.core.geometry import Transform, thin
+from carlasc.core.arrays import (
+    AnyArray,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    LabelArray,
+)
+from carlasc.core.geometry import Transform, invert, thin, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan, check_finite, lengths, sorted_by_origin
 from carlasc.errors import FormatError, MissingDataError
-from carlasc.groundtruth.from_scans.merging import Instant, Merger, PreparedScan
-from carlasc.groundtruth.inputs import without_caches
+from carlasc.groundtruth.from_scans.free_space import FreeSpace
+from carlasc.groundtruth.from_scans.merging import Cast, Instant, Merger, PreparedScan
+from carlasc.groundtruth.inputs import GridPlan, without_caches
 from carlasc.groundtruth.options import FromScans
 from carlasc.motion import (
     EvidenceScan,
@@ -47,8 +55,8 @@ _ACTOR_POINTS = (
     400  # greatest number of points of an actor in one scan, for its motion and its body
 )
 _SAMPLES = 5  # number of scans that decide whether labels name the ground
-# greatest share of ground points with other classes: walls and kerbs give 2 to 4 %, labels that are
-# often wrong 15 %
+# greatest share of ground points with other classes: walls and kerbs give 2 to 4%, labels that are
+# often wrong 15%
 _OTHERWISE = 0.1
 # fields of a scan that are read for merging
 _USED = (
@@ -136,7 +144,8 @@ class ScanFeed:
             else metadata.max_range_m or np.inf
         )
         self._scans: OrderedDict[int, PreparedScan] = OrderedDict()
-        self._merger: Merger | None = None
+        self._merger = Merger(self.read, MovingActors(), self.classes, options.dynamic)
+        self._free: FreeSpace | None = None
         self._lock = threading.RLock()  # an executor may be of threads
         self.key = uuid4().hex
         self.contents: dict[int, str] = {}
@@ -176,7 +185,8 @@ class ScanFeed:
     @cached_property
     def times(self) -> dict[int, float]:
         """Seconds since the first frame, by frame with points."""
-        return {frame: self.time(frame) for frame in self.frames.tolist()}
+        times = self.sequence.times_of(self.frames).tolist()
+        return dict(zip(self.frames.tolist(), times, strict=True))
 
     @property
     def has_labels(self) -> bool:
@@ -289,9 +299,8 @@ class ScanFeed:
         # The farthest corner of the grid and the farthest point of the scan, both as spheres: a
         # scan that cannot reach the grid costs as much as one that does.
         here = self.pose(frame)
-        corners = np.array(np.meshgrid(*zip(spec.lower, spec.upper, strict=True))).reshape(3, -1).T
         across = (
-            float(np.linalg.norm(corners, axis=1).max())
+            float(np.linalg.norm(_corners(spec), axis=1).max())
             if spec.coordinates == "cartesian"
             else np.hypot(spec.upper[0], max(abs(spec.lower[2]), abs(spec.upper[2])))
         )
@@ -329,11 +338,30 @@ class ScanFeed:
         Its caches are kept from frame to frame.
         """
         with self._lock:
-            if self._merger is None:
-                self._merger = Merger(self.read, actors, self.classes, self.options.dynamic)
             self._merger.actors = actors
             self._merger.forget_before(frame + self.options.window[0])
             return self._merger
+
+    def free_space(self, plan: GridPlan) -> FreeSpace:
+        """Return the maps of free space, which are kept from frame to frame."""
+        first, last = self.options.window
+        corners, map_T_world = _corners(plan.spec), invert(self.pose(int(self.frames[0])))
+
+        def cast_of(frame: int, within_s: float) -> Cast:
+            # of all frames, made or not: counts do not depend on which frames are made
+            near = self.frames[(self.frames >= frame - last) & (self.frames <= frame - first)]
+            grids = [
+                transform_points(self.pose(other), corners)
+                for other in near.tolist()
+                if abs(self.times[other] - self.times[frame]) <= within_s
+            ]
+            around = transform_points(map_T_world, np.concatenate(grids))
+            return self.read(frame).cast(map_T_world, around.min(axis=0), around.max(axis=0))
+
+        with self._lock:
+            if self._free is None or self._free.plan != plan:
+                self._free = FreeSpace(plan, map_T_world, self.options.stride, cast_of)
+            return self._free
 
     def instant(self, frame: int) -> Instant:
         """Return the time and the pose of a frame."""
@@ -341,9 +369,8 @@ class ScanFeed:
 
     def time(self, frame: int) -> float:
         """Return seconds since the first frame."""
-        if layout.TIMES in self.sequence.documents():
-            return self.sequence.read_time(frame)
-        return frame * layout.FRAME_PERIOD_S
+        known = self.times.get(frame)
+        return float(self.sequence.times_of([frame])[0]) if known is None else known
 
     def read(self, frame: int) -> PreparedScan:
         """Read a scan for merging; the most recent ones are cached."""
@@ -470,6 +497,14 @@ class ScanFeed:
         with np.errstate(invalid="ignore", over="ignore"):
             distance = lengths(scan.points if origins is None else scan.points - origins)
             return (distance >= self.min_range_m) & (distance <= self.max_range_m)
+
+
+def _corners(spec: GridSpec) -> FloatArray:
+    """Return the (8, 3) corners of the box around a grid, metres."""
+    lower, upper = list(spec.lower), list(spec.upper)
+    if spec.coordinates == "cylindrical":
+        lower[:2], upper[:2] = [-upper[0]] * 2, [upper[0]] * 2
+    return np.array(np.meshgrid(*zip(lower, upper, strict=True)), np.float64).reshape(3, -1).T
 
 
 _FEEDS: dict[str, ScanFeed] = {}  # the feed of this process, by the key of its copies: see ScanFeed

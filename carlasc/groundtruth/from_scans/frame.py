@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.arrays import (
     AnyArray,
+    AnyFloatArray,
     AnyIntArray,
     BoolArray,
     Float32Array,
+    Int32Array,
     IntArray,
     LabelArray,
     Uint8Array,
@@ -22,11 +23,12 @@ from carlasc.core.arrays import (
 from carlasc.core.cells import count_points
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
+from carlasc.groundtruth.from_scans.above import find_above
 from carlasc.groundtruth.from_scans.actor_voxels import find_voxels
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import STATIC, BodyRegions, Instant, Merger
 from carlasc.groundtruth.inputs import FrameData, GridPlan
-from carlasc.groundtruth.voting.ballot import Ballot, Observation, Votes
+from carlasc.groundtruth.voting.ballot import Ballot, Observation, SeenClass, Votes
 from carlasc.groundtruth.voting.certainty import (
     UNKNOWN,
     ClassConsensus,
@@ -44,6 +46,7 @@ from carlasc.motion.tracks import MovingActors
 # The volume that is inside of any recording vehicle: metres around the sensor.
 _OWN_LOWER, _OWN_UPPER = np.array([-2.2, -0.75, -1.2]), np.array([2.2, 0.75, 0.0])
 _OWN_PROBABILITY = 0.01
+_ABOVE_PROBABILITY = 0.01  # of an unknown voxel above a body
 _RETURNED_PROBABILITY = 0.6  # of a voxel with a return of this scan that other scans saw free
 # Hits per metre of free path in a voxel with a return of the frame's own scan, below which this
 # return is an outlier: with other returns around it, and without.
@@ -75,22 +78,24 @@ def merge_frame(
         feed.classes,
     )
 
-    merger.rays = options.rays if plan.rule == "ray" else "all"
-
-    # The static scene votes in all voxels, and each moving actor in the voxels of its body.
+    # Free space comes from maps, in which each ray is followed once for all frames. The frame's own
+    # rays count everywhere, and those of other scans outside of bodies, or in the body of an actor.
     regions = BodyRegions.at(merger, now, window, plan.spec)
-    steps, bodies = _FrameSteps(plan, feed, merger, now, window, regions), regions.actors
-    recent = merger.recent(now, window)  # first, to know which voxels they saw
-    ballot = steps.ballot(count_views=plan.needs_evidence)
-    for observation in merger.observations(now, recent):
-        ballot.add(observation)
-    seen_now = ballot.seen()
-    others = merger.observations(now, (other for other in window if other not in recent))
-    for observation in chain(others, merger.in_bodies(now, window, bodies)):
-        ballot.add(observation)
-    votes, views = ballot.votes(copy=False), ballot.views if plan.needs_evidence else None
+    space = feed.free_space(plan)
+    space.forget_others(merger.actors.tracks)
+    steps = _FrameSteps(plan, feed, merger, now, window, regions)
+    own = steps.vote([], [merger.own(now)] if frame in window else [])
+    own_free, seen_now = own.free[steps.in_body], own.seen()
+    del own  # frees memory for the next ballots
+    # The static scene votes in all voxels, and each moving actor in the voxels of its body.
+    bodies = list(merger.bodies(now, window, regions))
+    ballot = steps.vote([*merger.points(now, window), *(body.points for body in bodies)])
+    ballot.free[:] = space.count("scene", now, window)
+    ballot.free[steps.in_body] = own_free
+    space.add_bodies(bodies, now, ballot.free)
+    votes = ballot.votes(copy=False)
+    del ballot
     # The votes are whole now: what follows decides, completes and corrects, in this order.
-    del ballot  # frees memory for the next ballots
     if plan.rule != "ray":
         whole = votes.to_grid()
         return FrameData(
@@ -101,22 +106,22 @@ def merge_frame(
 
     # In these voxels, free space of rays beside a body or of other times does not count.
     contested = steps.contested()
-    unseen = contested[~seen_now[contested]]
-    if len(unseen):  # recent scans may have moving points there
-        unseen = unseen[~steps.vote(merger.moving(now, recent)).hit[unseen]]
+    recent = merger.recent(now, window) if len(contested) else []
+    unseen = contested[space.count("recent", now, recent, contested) == 0]
     doubtful = np.concatenate([regions.hidden, unseen])
     made.forget(doubtful[made.labels[doubtful] == 0])
 
     # Actors are completed by their mirror images, then by the surfaces of their tracks.
-    completing = list[Iterator[Observation]]()
-    if bodies and options.complete != "seen":
-        completing.append(merger.in_bodies(now, window, bodies, mirror=True))
-        if options.complete == "body":
-            completing.append(merger.shells(now, bodies))
     completed = list[tuple[IntArray, AnyArray]]()
-    for observations in completing:
-        completions = steps.vote(observations).votes(copy=False)
-        completed.append(steps.complete(made, completions))
+    if regions.actors and options.complete != "seen":
+        bodies = list(merger.bodies(now, window, regions, mirror=True))
+        mirrored = steps.vote(body.points for body in bodies)
+        space.add_bodies(bodies, now, mirrored.free)
+        completed.append(steps.complete(made, mirrored.votes(copy=False)))
+        if options.complete == "body":
+            del mirrored
+            shells = steps.vote(merger.shells(now, regions))
+            completed.append(steps.complete(made, shells.votes(copy=False)))
 
     # After completion: an inferred body must not stand where the recording vehicle drove.
     if options.own_path and options.dynamic != "tube":
@@ -126,19 +131,29 @@ def merge_frame(
     # Last, because what the frame's own scan saw is stronger than all inferences above.
     if consensus is not None:
         steps.keep_returns(made, votes, consensus)
+    above = _NO_VOXELS
+    if options.complete != "seen" and options.dynamic != "tube":
+        above = steps.free_above(made)
     who = steps.actors(made.labels)
     if feed.must_find_ground:  # ground that was found had a class for the votes only
         made.labels[np.isin(made.labels, sorted(classes.ground))] = classes.geometry_id
     size = plan.spec.size
     grid = Grid(plan.spec, made.labels.reshape(size), made.counts.reshape(size))
-    if made.occupied is None or views is None:
+    if made.occupied is None:
         return FrameData({}, grid, votes, None, who, votes.boxes)
-    inferred = np.concatenate([_NO_VOXELS, *(voxels for voxels, _ in completed)])
+    inferred = np.concatenate([above, *(voxels for voxels, _ in completed)])
     flags, shares = (
-        steps.flags(inferred, contested),
+        steps.flags(inferred, contested, seen_now),
         _join_shares(votes, consensus, completed, classes),
     )
-    evidence = VoxelCertainty(made.occupied.reshape(size), shares, flags.reshape(size), views)
+    views = space.count("views", now, window)
+    views[steps.in_body] = 0  # rays of other times
+    np.maximum.at(views, votes.occupied["voxel"], votes.occupied["voters"])
+    np.maximum(views, made.counts > 0, out=views)  # free space is summed over smaller cells
+    views_of_voxels = views.astype(np.uint16).reshape(size)
+    evidence = VoxelCertainty(
+        made.occupied.reshape(size), shares, flags.reshape(size), views_of_voxels
+    )
     return FrameData({}, grid, votes, evidence, who, votes.boxes)
 
 
@@ -308,37 +323,30 @@ class _FrameSteps:
             self.plan.spec, self.feed, merger.actors, self.now, self.regions, self.window, labels
         )
 
-    def flags(self, inferred: IntArray, contested: IntArray) -> Uint8Array:
+    def flags(self, inferred: IntArray, contested: IntArray, seen_now: BoolArray) -> Uint8Array:
         """Return (V,) uint8: the flags of each voxel."""
-        own = [self.now.frame] if self.now.frame in self.window else []
-        now = self.vote(self.merger.observations(self.now, own))
         flags = np.zeros(self.plan.spec.num_voxels, np.uint8)
         for where, flag in (
             (inferred, VoxelFlag.INFERRED),
             (contested, VoxelFlag.CONTESTED),
-            (now.seen(), VoxelFlag.SEEN_NOW),
+            (seen_now, VoxelFlag.SEEN_NOW),
             (self.in_body, VoxelFlag.IN_ACTOR),
         ):
             flags[where] |= np.uint8(flag)
         return flags
 
-    def ballot(self, count_views: bool = False) -> Ballot:
-        """Return a ballot without votes."""
-        return Ballot(
+    def vote(self, points: Iterable[SeenClass], observations: Iterable[Observation] = ()) -> Ballot:
+        """Return the votes of points without rays, and of observations."""
+        ballot = Ballot(
             self.plan.spec,
             self.feed.classes,
             rule=self.plan.rule,
             free_step_m=self.plan.voting.free_step_m,
-            regions=self.regions.of_voxel,
-            count_views=count_views,
             keep_boxes=self.plan.voting.keep_seen,
         )
-
-    def vote(self, observations: Iterable[Observation]) -> Ballot:
-        """Return the votes of observations, each in its region."""
-        ballot = self.ballot()
         for observation in observations:
             ballot.add(observation)
+        ballot.add_points(points)
         return ballot
 
     def _evidence(
@@ -372,8 +380,21 @@ class _FrameSteps:
         """Return the voxels outside of bodies that moving points are in at other times."""
         if self.feed.options.dynamic != "align":
             return _NO_VOXELS
-        others = [other for other in self.window if other != self.now.frame]
-        return np.flatnonzero(self.vote(self.merger.moving(self.now, others)).hit & ~self.in_body)
+        passing = np.zeros(self.plan.spec.num_voxels, np.int32)
+        for other in self.window:
+            if other != self.now.frame:
+                self._count(self.merger.moving(other), other, passing)
+        return np.flatnonzero((passing > 0) & ~self.in_body)
+
+    def _count(
+        self, points: AnyFloatArray, frame: int, counts: Int32Array | None = None
+    ) -> Int32Array:
+        """Return the number of points in each voxel: (N, 3) metres, frame of a scan.
+
+        They are added to (V,) existing counts.
+        """
+        grid_T_sensor = self.now.grid_T_world @ self.feed.pose(frame)
+        return count_points(points, grid_T_sensor, self.plan.spec, counts)
 
     def keep_returns(self, made: _UnfinishedGrid, votes: Votes, consensus: ClassConsensus) -> None:
         """Make voxels with returns of the frame's own scan occupied, unless the returns are
@@ -381,18 +402,15 @@ class _FrameSteps:
         """
         if self.now.frame not in self.window:
             return
-        spec, scan = self.plan.spec, self.feed.read(self.now.frame)
-        points = (
-            scan.points
-            if self.merger.dynamic != "drop"
-            else scan.points[self.merger.static(self.now.frame)]
-        )
+        points = self.feed.read(self.now.frame).points
+        if self.merger.dynamic == "drop":
+            points = points[self.merger.static(self.now.frame)]
         # Other scans may have seen such a voxel free, as a thin object in it stops few rays. A
         # return is an outlier only if very many rays passed; fewer are enough if it is alone.
-        returns = count_points(points, self.now.grid_T_world @ scan.world_T_sensor, spec)
+        returns = self._count(points, self.now.frame)
         returned = np.flatnonzero(returns)
         lost = returned[(made.labels[returned] == 0) & (consensus.labels[returned] > 0)]
-        is_single = (returns[lost] == 1) & ~_have_neighbours(lost, returned, spec)
+        is_single = (returns[lost] == 1) & ~_have_neighbours(lost, returned, self.plan.spec)
         rows = votes.occupied[np.isin(votes.occupied["voxel"], lost)]
         hits = np.bincount(np.searchsorted(lost, rows["voxel"]), rows["votes"], len(lost))
         free = votes.free.reshape(-1)[lost]
@@ -401,6 +419,17 @@ class _FrameSteps:
         kept = lost[is_kept]
         made.labels[kept], made.counts[kept] = consensus.labels[kept], (hits + free)[is_kept]
         made.set_probability(kept, _RETURNED_PROBABILITY)
+
+    def free_above(self, made: _UnfinishedGrid) -> IntArray:
+        """Make unknown voxels above vehicles and people free; return them."""
+        classes, solid = self.feed.classes, made.labels > 0
+        bodies = solid & self.in_body & ~np.isin(made.labels, sorted(classes.ground))
+        if self.feed.has_labels:
+            bodies |= np.isin(made.labels, sorted(classes.movable))
+        voxels = find_above(solid, made.counts > 0, bodies, self.plan.spec)
+        made.counts[voxels] = 1
+        made.set_probability(voxels, _ABOVE_PROBABILITY)
+        return voxels
 
     def driven(self, made: _UnfinishedGrid) -> IntArray:
         """Return the occupied voxels on the ego path of other frames, without ground, bodies and
@@ -413,18 +442,11 @@ class _FrameSteps:
         path = np.zeros(self.plan.spec.num_voxels, np.int32)
         for other in self.window:
             if other != self.now.frame:
-                count_points(
-                    body, self.now.grid_T_world @ self.feed.pose(other), self.plan.spec, path
-                )
+                self._count(body, other, path)
         voxels = np.flatnonzero((path > 0) & (made.labels > 0))
         solid = ~np.isin(made.labels[voxels], sorted(self.feed.classes.ground))
         there_now = self.in_body  # and where the frame's own scan has points
         if self.now.frame in self.window:
-            scan = self.feed.read(self.now.frame)
-            there_now = there_now | (
-                count_points(
-                    scan.points, self.now.grid_T_world @ scan.world_T_sensor, self.plan.spec
-                )
-                > 0
-            )
+            own = self.feed.read(self.now.frame).points
+            there_now = there_now | (self._count(own, self.now.frame) > 0)
         return voxels[solid & ~there_now[voxels]]

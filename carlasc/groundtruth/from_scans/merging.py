@@ -8,14 +8,14 @@ Free space of the static scene from other scans does not count there.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.core.arrays import (
     AnyFloatArray,
@@ -25,15 +25,14 @@ from carlasc.core.arrays import (
     Int32Array,
     IntArray,
     LabelArray,
-    Uint8Array,
     Uint16Array,
 )
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import RaysFromPlace, lengths, runs_of_origins
-from carlasc.groundtruth.options import Dynamic, Rays
-from carlasc.groundtruth.voting.ballot import NOWHERE, Observation
+from carlasc.groundtruth.options import Dynamic
+from carlasc.groundtruth.voting.ballot import ClassPoints, Observation, SeenClass
 from carlasc.motion import BODY_MARGIN_M
 from carlasc.motion.tracks import MovingActors, Track
 from carlasc.storage import layout
@@ -41,15 +40,11 @@ from carlasc.storage import layout
 STATIC = 0  # region of the voxels that belong to no actor
 # fact: deformable
 _DEFORMABLE_S = 0.85  # the shape of a person is used for this time before and after
-_RECENT_S = 0.25  # scans within this time before and after a frame show the scene at the frame
+RECENT_S = 0.25  # scans within this time before and after a frame show the scene at the frame
 # Points so near to the body of an actor may belong to it, as paths have errors: metres along,
 # across and up.
 _AROUND_M = np.array([0.3, 0.3, 0.1])
-_MIRROR, _MIRRORED = np.diag([1.0, -1.0, 1.0, 1.0]), np.array([1, -1, 1], np.float32)
-# area of a sphere around the sensor, over the number of points, in which one ray is enough
-_POINT_M2 = 0.004
-# 2 ** 32 times the fractional parts of the golden ratio and of the square root of 2
-_GOLDEN, _SILVER = 2654435769, 1779033703  # their multiples modulo 2 ** 32 are evenly spread
+_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -70,6 +65,24 @@ class Instant:
     def grid_T_world(self) -> Transform:
         """(4, 4), the inverse of the grid's pose."""
         return invert(self.world_T_grid)
+
+
+class Cast(NamedTuple):
+    """The rays of one scan.
+
+    Attributes:
+        points: (N, 3) float32, metres, from the origin of each ray, in the order of origins.
+        ends: (K,) index after the last point of each origin.
+        map_T_places: (K, 4, 4) poses of the origins.
+        lower: (3,) lower corner of the region in which the rays count, metres, frame of the map.
+        upper: (3,) upper corner.
+    """
+
+    points: Float32Array
+    ends: IntArray
+    map_T_places: FloatArray
+    lower: FloatArray
+    upper: FloatArray
 
 
 @dataclass(frozen=True)
@@ -157,52 +170,27 @@ class PreparedScan:
 
     @cached_property
     def world_T_places(self) -> FloatArray:
-        """(4, 4) pose of the sensor, or (K, 4, 4) poses of the origins of rays."""
-        places = np.stack([rays.sensor_T_place for rays in self.rays])
-        return (
-            self.world_T_sensor @ places
-            if len(places) > 1 or places[0, :3, 3].any()
-            else self.world_T_sensor
-        )
+        """(K, 4, 4) poses of the origins of rays."""
+        return self.world_T_sensor @ np.stack([rays.sensor_T_place for rays in self.rays])
 
-    @cached_property
-    def enough(self) -> tuple[NDArray[np.intp], Uint8Array]:
-        """(M,) indices of the rays that vote with `rays="enough"`, and their (M,) weights: near the
-        sensor, one of up to four votes for all.
-
-        The choice depends on the frame number and the index of the ray alone, so that scans of one
-        place use different rays.
-        """
-        crowd = (
-            len(self.ends) * _POINT_M2 / np.maximum(np.square(lengths(self.ends)), np.float32(1e-3))
-        )
-        power = ((crowd >= 2).astype(np.uint32) + (crowd >= 4)).astype(np.uint32)
-        turn = np.arange(len(power), dtype=np.uint32) * np.uint32(_GOLDEN) + np.uint32(
-            self.frame * _SILVER % 2**32
-        )
-        chosen = np.flatnonzero(turn <= np.uint32(2**32 - 1) >> power)
-        return chosen, np.left_shift(1, power[chosen]).astype(np.uint8)
-
-    def votes_of(self, labels: Uint16Array, hits: BoolArray | None) -> dict[str, Any]:
-        """Return arguments of `Observation` for the votes of the scan: all except poses and
-        regions.
+    def cast(self, map_T_world: Transform, lower: FloatArray, upper: FloatArray) -> Cast:
+        """Return the rays for a map of free space: those that pass through a region.
 
         Args:
-            labels: (N,) uint16, the classes of the points.
-            hits: (N,) bool, points that vote for their class; None: all.
+            map_T_world: (4, 4).
+            lower: (3,) lower corner of the region, metres, frame of the map.
+            upper: (3,) upper corner.
         """
-        ends = (
-            None
-            if self.world_T_places.ndim == 2
-            else np.array([rays.part.stop for rays in self.rays])
-        )
-        return {
-            "points": self.ends,
-            "labels": labels,
-            "hits": hits,
-            "sure": self.sure,
-            "ends": ends,
-        }
+        places = map_T_world @ self.world_T_places
+        origins, reach_m = places[:, :3, 3], self.reach_m  # where no point is, no ray is
+        lower = np.maximum(lower, origins.min(axis=0) - reach_m)
+        upper = np.minimum(upper, origins.max(axis=0) + reach_m)
+        return Cast(self.ends, self.runs, places, lower, upper)
+
+    @property
+    def runs(self) -> IntArray:
+        """(K,) index after the last ray of each origin."""
+        return np.array([rays.part.stop for rays in self.rays])
 
     def through(
         self, world_T_box: Transform, lower: FloatArray, upper: FloatArray
@@ -220,8 +208,37 @@ class PreparedScan:
             yield rays, box_T_place, rays.through(box_T_place, lower, upper)
 
 
+@dataclass(frozen=True)
+class _Carried:
+    """What a scan saw of the body of an actor, in the frame of the actor.
+
+    Attributes:
+        cast: the rays through the body.
+        points: (3, M) float32, metres, the points of the actor.
+    """
+
+    cast: Cast
+    points: Float32Array
+
+
+class SeenBody(NamedTuple):
+    """What scans saw of the body of an actor.
+
+    Attributes:
+        number: number of the actor.
+        world_T_actor: (4, 4) pose of the actor at the frame of the grid.
+        casts: the rays of each scan through the body, frame of the actor, by frame.
+        points: the points of the actor, in the voxels of its body.
+    """
+
+    number: int
+    world_T_actor: Transform
+    casts: dict[int, Cast]
+    points: SeenClass
+
+
 class Merger:
-    """Merges the scans of a window into the observations of one frame.
+    """Merges the scans of a window into the votes of one frame.
 
     Args:
         scan_of: returns the prepared scan of a frame.
@@ -238,137 +255,109 @@ class Merger:
         dynamic: Dynamic,
     ) -> None:
         self.scan_of, self.actors, self.classes, self.dynamic = scan_of, actors, classes, dynamic
-        self.rays: Rays = "all"
-        self._static: dict[int, BoolArray] = {}
-        self._labels: dict[int, Uint16Array] = {}
-        self._carried: dict[tuple[int, int], tuple[Observation, ...]] = {}
-        self._sampled: dict[int, dict[str, Any]] = {}
-        self._moving: dict[int, tuple[Float32Array, Uint16Array]] = {}
+        # of each scan, by its frame; then of its points by class, in its own grid or in others, and
+        # of what it saw of each actor
+        self._static = dict[int, BoolArray]()
+        self._labels = dict[int, Uint16Array]()
+        self._moving = dict[int, Float32Array]()
+        self._points = defaultdict[int, dict[bool, dict[int, ClassPoints]]](dict)
+        self._carried = defaultdict[int, dict[int, _Carried | None]](dict)
 
     def forget_before(self, frame: int) -> None:
         """Clear the caches of scans before a frame."""
-        for kept in (self._static, self._labels, self._moving, self._sampled):
+        for kept in (self._static, self._labels, self._moving, self._points, self._carried):
             for other in [key for key in kept if key < frame]:
                 del kept[other]
-        self._carried = {key: value for key, value in self._carried.items() if key[1] >= frame}
 
-    def observations(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
-        """Yield the observation of the static scene by each scan.
+    def own(self, now: Instant) -> Observation:
+        """Return the observation by the frame's own scan, whose rays count everywhere."""
+        scan = self.scan_of(now.frame)
+        places = now.grid_T_world @ scan.world_T_places
+        return Observation(scan.ends, self.labels(now.frame), places, scan.runs)
 
-        Static surfaces vote everywhere, so the road below an actor is kept. Free space from other
-        times does not count in the bodies of actors. The frame's own rays always count.
+    def points(self, now: Instant, window: Iterable[int]) -> list[SeenClass]:
+        """Return the static points of each scan, and all points of the frame's own scan, by class.
+
+        Static surfaces vote everywhere, so the road below an actor is kept.
 
         Args:
             now: the frame.
             window: frames of the scans.
         """
-        grid_T_world = now.grid_T_world
+        found = defaultdict[int, list[ClassPoints]](list)
         for other in window:
-            scan, own = self.scan_of(other), other == now.frame
-            everything = self.dynamic == "tube" or (own and self.dynamic != "drop")
-            hits = None if everything else self.static(other)
-            if everything and self.actors.own:  # points on the recording vehicle do not vote
-                hits = ~self.actors.is_own(scan.points)
-            sampled = self.rays == "enough" and not own
-            votes = self._enough(scan, hits) if sampled else scan.votes_of(self.labels(other), hits)
-            places = grid_T_world @ scan.world_T_places
-            yield Observation(grid_T_sensor=places, free_region=None if own else STATIC, **votes)
+            scan, kept, own = self.scan_of(other), self._points[other], other == now.frame
+            if own not in kept:
+                all_vote = self.dynamic == "tube" or (own and self.dynamic != "drop")
+                votes = ~self.actors.is_own(scan.points) if all_vote else self.static(other)
+                kept[own] = self._by_class(scan, votes)
+            pose = now.grid_T_world @ scan.world_T_sensor
+            for label, seen in kept[own].items():
+                found[label].append(seen._replace(grid_T_points=pose))
+        return [SeenClass(label, points) for label, points in found.items()]
 
-    def _enough(self, scan: PreparedScan, hits: BoolArray | None) -> dict[str, Any]:
-        """Return the votes of the rays that are enough: prepared once, for all frames that use
-        them.
-        """
-        if scan.frame not in self._sampled:
-            votes, (chosen, weights) = scan.votes_of(self.labels(scan.frame), hits), scan.enough
-            ends = votes.pop("ends")
-            parts = {
-                name: None if values is None else values[chosen] for name, values in votes.items()
-            }
-            parts["ends"] = None if ends is None else np.searchsorted(chosen, ends)
-            self._sampled[scan.frame] = {**parts, "weights": weights}
-        return self._sampled[scan.frame]
+    def _by_class(self, scan: PreparedScan, votes: BoolArray) -> dict[int, ClassPoints]:
+        """Return the points of a scan that vote, (N,) bool, by class; their poses are not set."""
+        found, labels = {}, np.where(votes, self.labels(scan.frame), np.uint16(0))
+        for label in np.flatnonzero(np.bincount(labels)).tolist():
+            if label:
+                rows = np.flatnonzero(labels == label)
+                points = np.ascontiguousarray(scan.points[rows].T)
+                sure = None if scan.sure is None else scan.sure[rows]
+                found[label] = ClassPoints(points, scan.world_T_sensor, sure)
+        return found
 
-    def in_bodies(
-        self,
-        now: Instant,
-        window: Iterable[int],
-        bodies: Mapping[int, int],
-        *,
-        mirror: bool = False,
-    ) -> Iterator[Observation]:
-        """Yield the observation of each actor's body by other scans, with a voter for each origin
-        of rays.
+    def bodies(
+        self, now: Instant, window: Iterable[int], regions: BodyRegions, *, mirror: bool = False
+    ) -> Iterator[SeenBody]:
+        """Yield what other scans saw of each actor in its body, without actors that none saw.
 
         Args:
             now: the frame.
             window: frames of the scans.
-            bodies: number of the actor by region, for the actors that vote in their bodies.
+            regions: the voxels of the bodies.
             mirror: yield mirror images instead. Vehicles are symmetric: their points and rays are
                 reflected in the vertical plane through the middle of the body, if that is known.
                 Only mirror images use the frame's own scan.
         """
-        window = [other for other in window if mirror or other != now.frame]
-        for region, number in bodies.items():
+        for region, number in regions.actors.items():
             track = self.actors.tracks[number]
             pose = track.pose(now.frame)
             if pose is None or (mirror and not (track.rigid and any(track.extent.known))):
                 continue
-            # Rays are carried in the frame of the actor, where they do not depend on the frame that
-            # is made: they are computed once for all frames of the window.
-            seen = list[Observation]()
+            pose = pose @ _MIRROR if mirror else pose
+            casts, points, grid_T_actor = {}, [], now.grid_T_world @ pose
             for other in window:
-                seen += self._carry(number, other, now)
-            if not seen:
-                continue
-            points = np.concatenate([carried.points for carried in seen])
-            places = np.stack([carried.grid_T_sensor for carried in seen])
-            grid_T_actor = now.grid_T_world @ pose
-            yield Observation(
-                points * _MIRRORED if mirror else points,
-                np.concatenate([carried.labels for carried in seen]),
-                grid_T_actor @ _MIRROR @ places @ _MIRROR if mirror else grid_T_actor @ places,
-                np.concatenate([carried.hits for carried in seen if carried.hits is not None]),
-                hit_region=region,
-                free_region=region,
-                ends=np.cumsum([len(carried) for carried in seen]),
-            )
+                if mirror or other != now.frame:
+                    carried = self._carry(number, other, now)
+                    if carried is not None:
+                        casts[other] = carried.cast
+                        points.append(ClassPoints(carried.points, grid_T_actor))
+            if casts:
+                votes = SeenClass(track.label, points, regions.of_voxel, region)
+                yield SeenBody(number, pose, casts, votes)
 
-    def moving(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
-        """Yield the moving points of each scan, at their positions in that scan.
-
-        No ray votes for free space.
-        """
-        for other in window:
-            scan = self.scan_of(other)
-            if other not in self._moving:
-                moving = np.flatnonzero(~self.static(other))
-                self._moving[other] = scan.points[moving], self.labels(other)[moving]
-            points, labels = self._moving[other]
-            if len(points):
-                yield Observation(
-                    points, labels, now.grid_T_world @ scan.world_T_sensor, free_region=NOWHERE
-                )
+    def moving(self, frame: int) -> Float32Array:
+        """Return the (M, 3) moving points of a scan, metres, sensor frame."""
+        if frame not in self._moving:
+            self._moving[frame] = self.scan_of(frame).points[~self.static(frame)]
+        return self._moving[frame]
 
     def recent(self, now: Instant, window: Iterable[int]) -> list[int]:
-        """Return the frames of the scans within `_RECENT_S` of the frame."""
+        """Return the frames of the scans within `RECENT_S` of the frame."""
         return [
-            other for other in window if abs(self.scan_of(other).seconds - now.seconds) <= _RECENT_S
+            other for other in window if abs(self.scan_of(other).seconds - now.seconds) <= RECENT_S
         ]
 
-    def shells(self, now: Instant, bodies: Mapping[int, int]) -> Iterator[Observation]:
-        """Yield the surface of each vehicle, for the parts that no scan saw.
-
-        No ray votes for free space.
-        """
-        for region, number in bodies.items():
+    def shells(self, now: Instant, regions: BodyRegions) -> Iterator[SeenClass]:
+        """Yield the surface of each vehicle in its body, for the parts that no scan saw."""
+        for region, number in regions.actors.items():
             track = self.actors.tracks[number]
             pose = track.pose(now.frame)
-            points = track.surface
-            if len(points) and pose is not None:
-                labels = np.full(len(points), track.label, np.uint16)
-                yield Observation(
-                    points, labels, now.grid_T_world @ pose, hit_region=region, free_region=NOWHERE
-                )
+            if len(track.surface) and pose is not None:
+                surface = np.ascontiguousarray(track.surface.T)
+                points = [ClassPoints(surface, now.grid_T_world @ pose)]
+                yield SeenClass(track.label, points, regions.of_voxel, region)
 
     def static(self, frame: int) -> BoolArray:
         """Return (N,) bool: the points of a scan that belong to no moving actor.
@@ -387,8 +376,15 @@ class Merger:
             ground = np.isin(scan.labels, sorted(self.classes.ground))
             for track in self.actors.tracks.values():
                 static[track.members.get(frame, [])] = False
-                near = _points_near(track, scan)
-                static[near[~ground[near]]] = False
+                lower, upper = track.lower - _AROUND_M, track.upper + _AROUND_M
+                pose = track.pose(frame)
+                for rays, actor_T_place, crossing in (
+                    () if pose is None else scan.through(pose, lower, upper)
+                ):
+                    body = transform_points(actor_T_place, rays.points[crossing])
+                    inside = ((body >= lower) & (body <= upper)).all(axis=1)
+                    near = rays.part.start + crossing[inside]
+                    static[near[~ground[near]]] = False
             self._static[frame] = static
         return self._static[frame]
 
@@ -404,37 +400,31 @@ class Merger:
             self._labels[frame] = labels
         return self._labels[frame]
 
-    def _carry(self, number: int, other: int, now: Instant) -> tuple[Observation, ...]:
-        """Return the rays of a scan through the body of an actor, in the actor frame; none if the
+    def _carry(self, number: int, other: int, now: Instant) -> _Carried | None:
+        """Return what a scan saw of the body of an actor; None if no ray passed through it, or the
         shape of the actor was different then.
         """
         track = self.actors.tracks[number]
         if not track.rigid and abs(self.scan_of(other).seconds - now.seconds) > _DEFORMABLE_S:
-            return ()
-        pose, through = track.pose(other), list[Observation]()
-        if (number, other) not in self._carried and pose is not None:
+            return None
+        kept, pose = self._carried[other], track.pose(other)
+        if number not in kept and pose is not None:
             scan = self.scan_of(other)
             own = np.zeros(len(scan.points), np.bool_)
             own[track.members.get(other, [])] = True
-            for rays, actor_T_place, crossing in scan.through(pose, track.lower, track.upper):
+            rays, hits, places = [], [], []
+            for part, actor_T_place, crossing in scan.through(pose, track.lower, track.upper):
                 if len(crossing):
-                    labels, hits = self.labels(other)[rays.part][crossing], own[rays.part][crossing]
-                    through.append(Observation(rays.points[crossing], labels, actor_T_place, hits))
-        return self._carried.setdefault((number, other), tuple(through))
-
-
-def _points_near(track: Track, scan: PreparedScan) -> IntArray:
-    """Return the indices of the points of a scan that are in the body of an actor, or within
-    `_AROUND_M` of it.
-    """
-    pose, near = track.pose(scan.frame), [np.empty(0, np.int64)]
-    if pose is None:
-        return near[0]
-    lower, upper = track.lower - _AROUND_M, track.upper + _AROUND_M
-    for rays, actor_T_place, crossing in scan.through(pose, lower, upper):
-        body = transform_points(actor_T_place, rays.points[crossing])
-        near.append(rays.part.start + crossing[((body >= lower) & (body <= upper)).all(axis=1)])
-    return np.concatenate(near)
+                    rays.append(part.points[crossing])
+                    seen = rays[-1][own[part.part][crossing]]
+                    hits.append(transform_points(actor_T_place, seen).astype(np.float32))
+                    places.append(actor_T_place)
+            if rays:
+                ends = np.cumsum([len(points) for points in rays])
+                cast = Cast(np.concatenate(rays), ends, np.stack(places), track.lower, track.upper)
+                points = np.ascontiguousarray(np.concatenate(hits).T)
+                kept[number] = _Carried(cast, points)
+        return kept.setdefault(number, None)
 
 
 @dataclass(frozen=True)
@@ -475,10 +465,9 @@ class BodyRegions:
         ]
         regions = cls.of_bodies(spec, now.world_T_grid, present)
         if merger.dynamic in ("align", "current") and now.frame in window:
-            scan = merger.scan_of(now.frame)
-            moving = scan.points[~merger.static(now.frame)]
+            grid_T_sensor = now.grid_T_world @ merger.scan_of(now.frame).world_T_sensor
             return regions.with_points(
-                spec, transform_points(now.grid_T_world @ scan.world_T_sensor, moving)
+                spec, transform_points(grid_T_sensor, merger.moving(now.frame))
             )
         return regions
 

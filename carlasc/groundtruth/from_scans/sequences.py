@@ -299,7 +299,6 @@ class ScanSequence(StoredSequence):
         record |= {"observe": "scans", "motion": motion, "dynamic": options.dynamic}
         record |= {"complete": options.complete} if options.dynamic == "align" else {}
         record |= {} if options.own_path else {"own_path": False}
-        record |= {"rays": options.rays} if options.rays != "all" else {}
         record |= {"poses": "kiss-icp"} if self.estimates_poses else {}
         record |= {"refine": options.poses.refine} if self.refines else {}
         record |= {"window": f"{options.window[0]}:{options.window[1]}", "stride": options.stride}

@@ -9,9 +9,9 @@ and a voxel without votes is unknown: see the format page, `docs/format.md#votes
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import get_args
+from typing import TYPE_CHECKING, NamedTuple, get_args
 
 import numpy as np
 
@@ -32,13 +32,10 @@ from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.storage.field_files import VOTES_DTYPE, WIDE_VOTES_DTYPE
 
+if TYPE_CHECKING:
+    from carlasc.core.cells import Pose
+
 _MOST_VOTES = int(np.iinfo(VOTES_DTYPE["votes"]).max)
-_NONE = np.empty(0, np.int64)
-# Voxels outside of a region are few if they are so many times fewer than all: then it is faster to
-# count every sample and to restore these voxels afterwards than to look up the region of each one.
-_FEW = 8
-NOWHERE = 65534
-"""A region without voxels: rays with it do not vote."""
 OCCUPIED_DTYPE = np.dtype(
     [
         ("voxel", np.int32),
@@ -64,14 +61,7 @@ class Observation:
             rounding to float32 is part of the rule: see the format page, `docs/format.md#votes`.
         labels: (N,) unsigned integer class ids. Points labelled 0 and their rays do not vote.
         grid_T_sensor: (4, 4) float64, from the sensor's frame to the grid's; or (K, 4, 4).
-        hits: (N,) bool, points that vote for their class; for the other points only the rays vote.
-            None: all points.
-        hit_region: region of the grid in which the points vote; None for the whole grid.
-        free_region: region of the grid in which the rays vote; None for the whole grid.
-        sure: (N,) float32, probability of the class of each point; None: 1.
         ends: (K,) int64, index after the last point of each voter; None: one voter.
-        weights: (N,) uint8, number of votes of each ray, unless there is one vote per voxel; None:
-            1.
 
     Raises:
         FormatError: points and labels differ in length, have another shape or type, or the
@@ -81,12 +71,7 @@ class Observation:
     points: Float32Array
     labels: LabelArray
     grid_T_sensor: Transform
-    hits: BoolArray | None = None
-    hit_region: int | None = None
-    free_region: int | None = None
-    sure: Float32Array | None = None
     ends: IntArray | None = None
-    weights: Uint8Array | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype != np.float32:
@@ -98,12 +83,6 @@ class Observation:
         if self.labels.dtype.kind != "u":
             raise FormatError(
                 "observation labels", expected="unsigned integers", found=str(self.labels.dtype)
-            )
-        if self.hits is not None and self.hits.shape != self.labels.shape:
-            raise FormatError(
-                "observation hits",
-                expected=f"shape ({len(self.points)},)",
-                found=str(self.hits.shape),
             )
         check_rigid(self.grid_T_sensor, "observation grid_T_sensor")
         poses, ends = np.shape(self.grid_T_sensor)[:-2], self.ends
@@ -119,6 +98,39 @@ class Observation:
 
     def __len__(self) -> int:
         return len(self.points)
+
+
+class ClassPoints(NamedTuple):
+    """The points of one class that one voter saw.
+
+    Attributes:
+        points: (3, N) float32, metres.
+        grid_T_points: (4, 4).
+        sure: (N,) float32, probability of the class of each point; None: 1.
+    """
+
+    points: Float32Array
+    grid_T_points: Transform
+    sure: Float32Array | None = None
+
+
+_EVERYWHERE = np.empty(0, np.uint16)
+
+
+class SeenClass(NamedTuple):
+    """The points of one class, and where they vote.
+
+    Attributes:
+        label: the class.
+        voters: the points that each voter saw.
+        regions: (V,) region of each voxel; empty: the points vote in all voxels.
+        region: the region in whose voxels they vote.
+    """
+
+    label: int
+    voters: Sequence[ClassPoints]
+    regions: Uint16Array = _EVERYWHERE
+    region: int = 0
 
 
 def count_votes(
@@ -181,12 +193,10 @@ class Ballot:
         rule: "sensor": at most one vote per observation, voxel and class; "sample" and "ray": every
             sample counts.
         free_step_m: distance between two free samples on a ray, in metres.
-        count_views: also count how many observations saw each voxel; not with "sensor".
-        regions: (V,) uint16, region of each voxel, for observations that vote in one region only.
         keep_boxes: also keep the box around the points in each voxel of a Cartesian grid.
 
     Raises:
-        ArgumentError: an unknown rule, a distance that is not positive, or regions that do not fit.
+        ArgumentError: an unknown rule, or a distance that is not positive.
     """
 
     def __init__(
@@ -196,8 +206,6 @@ class Ballot:
         *,
         rule: VoteRule = "sensor",
         free_step_m: float = 1.5,
-        regions: Uint16Array | None = None,
-        count_views: bool = False,
         keep_boxes: bool = False,
     ) -> None:
         # Numba is loaded here, not with the module: options of commands import names of rules only.
@@ -205,10 +213,6 @@ class Ballot:
         from carlasc.groundtruth.voting import filled, kernel
 
         check_rule(rule, free_step_m)
-        if regions is not None and regions.shape != (spec.num_voxels,):
-            raise ArgumentError(
-                "regions", expected=f"shape ({spec.num_voxels},)", found=str(regions.shape)
-            )
         self.spec, self.classes, self.rule, self.free_step_m = (
             spec,
             classes,
@@ -219,8 +223,7 @@ class Ballot:
         once = rule == "sensor"
         # The arrays of free space have one element more than there are voxels: samples outside of
         # the grid count there, so that the inner loop needs no branch.
-        viewed = spec.num_voxels + 1 if count_views else 0
-        self._cells, self._outside = Cells.of(spec), dict[int, IntArray]()
+        self._cells = Cells.of(spec)
         self._boxes = filled.no_boxes(spec.num_voxels) if keep_boxes else None
         self._tally = kernel.Tally(
             once,
@@ -229,11 +232,6 @@ class Ballot:
             heads=np.full(spec.num_voxels, kernel.NONE, np.int32),
             candidates=np.empty(0, kernel.CANDIDATE_DTYPE),
             used=np.zeros(1, np.int64),
-            regions=np.empty(0, np.uint16)
-            if regions is None
-            else np.append(regions, np.uint16(kernel.OUTSIDE)),
-            views=np.zeros(viewed, np.uint16),
-            viewers=np.full(viewed, kernel.NONE, np.int32),
         )
 
     def add(self, observation: Observation) -> None:
@@ -242,71 +240,64 @@ class Ballot:
         Raises:
             FormatError: a label is not below the class table's number of channels; no vote was
                 added.
-            ArgumentError: it votes in a region, and the ballot has none.
         """
-        from carlasc.groundtruth.voting import filled, kernel
+        from carlasc.core.cells import as_pose
+        from carlasc.groundtruth.voting import kernel
 
         self.classes.check(observation.labels, "observation labels")
-        hit_region = kernel.ANYWHERE if observation.hit_region is None else observation.hit_region
-        free_region = (
-            kernel.ANYWHERE if observation.free_region is None else observation.free_region
-        )
-        if not len(self._tally.regions) and (hit_region, free_region) != (
-            kernel.ANYWHERE,
-            kernel.ANYWHERE,
-        ):
-            raise ArgumentError(
-                "observation",
-                expected="no region, as the ballot has none",
-                found="one that votes in a region",
-            )
         ends = np.array([len(observation)]) if observation.ends is None else observation.ends
         self._make_room(len(observation))
         cast = kernel.Voters(
             _ready(observation.points, np.float32).reshape(-1),
             _ready(observation.labels, np.uint16),
-            _ready(observation.hits, np.bool_),
-            _ready(observation.sure, np.float32),
-            _ready(observation.weights, np.uint8),
             np.ascontiguousarray(observation.grid_T_sensor, np.float64)
             .reshape(-1, 16)[:, :12]
             .copy(),
             ends,
         )
-        kernel.vote(
-            cast,
-            self._cells,
-            self.free_step_m,
-            self.num_observations,
-            hit_region,
-            kernel.NOT_AT_ALL if free_region == NOWHERE else free_region,
-            self._apart(free_region),
-            self._tally,
-        )
+        voter = self.num_observations
+        kernel.vote(cast, self._cells, self.free_step_m, voter, self._tally)
         if self._boxes is not None:
-            filled.widen_boxes(cast, self._cells, hit_region, self._tally.regions, self._boxes)
+            voting = observation.labels > 0
+            for pose, begin, end in zip(cast.poses, [0, *ends], ends, strict=False):
+                points = observation.points[begin:end][voting[begin:end]]
+                self._widen(points.T, as_pose(pose.reshape(3, 4)))
         # Each origin of rays is a voter, with a number of its own: `once` compares these numbers.
         self.num_observations += len(ends)
 
-    def _apart(self, region: int) -> IntArray:
-        """Return the voxels outside of a region, if they are few and each sample counts; otherwise
-        none.
-        """
-        if region < 0 or region == NOWHERE or self._tally.once:
-            return _NONE
-        if region not in self._outside:
-            outside = self._tally.regions != region
-            few = np.count_nonzero(outside) * _FEW < len(outside)
-            self._outside[region] = np.flatnonzero(outside) if few else _NONE
-        return self._outside[region]
+    def add_points(self, seen: Iterable[SeenClass]) -> None:
+        """Add the votes of points without rays, one class after the other."""
+        from carlasc.core.cells import as_pose
+        from carlasc.groundtruth.voting import kernel
+
+        counted = np.zeros(self.spec.num_voxels + 1, kernel.HIT_DTYPE)
+        for label, voters, regions, region in seen:
+            points, number = sum(one.points.shape[1] for one in voters), 0
+            hit = np.empty(min(points, len(counted)), np.int32)
+            certain = all(one.sure is None for one in voters)
+            doubt = np.zeros(0 if certain else len(counted), np.float32)
+            for voter, one in enumerate(voters, 1):
+                pose, sure = as_pose(one.grid_T_points), _ready(one.sure, np.float32)
+                number = kernel.count_hits(
+                    one.points, sure, pose, self._cells, voter, counted, doubt, hit, number
+                )
+                self._widen(one.points, pose, regions, region)
+            self._make_room(number)
+            kernel.add_hits(label, counted, doubt, hit[:number], regions, region, self._tally)
+
+    def _widen(
+        self, points: Float32Array, pose: Pose, regions: Uint16Array = _EVERYWHERE, region: int = 0
+    ) -> None:
+        from carlasc.groundtruth.voting import filled
+
+        if self._boxes is not None:
+            ready = _ready(points, np.float32)
+            filled.widen_boxes(ready, pose, self._cells, regions, region, self._boxes)
 
     @property
-    def views(self) -> Uint16Array:
-        """(X, Y, Z) uint16: number of observations that saw each voxel; a copy.
-
-        Only with `count_views`.
-        """
-        return self._tally.views[:-1].reshape(self.spec.size).copy()
+    def free(self) -> AnyArray:
+        """(V,) votes for free space; a view."""
+        return self._tally.free[:-1]
 
     @property
     def hit(self) -> BoolArray:
@@ -317,7 +308,7 @@ class Ballot:
 
     def seen(self) -> BoolArray:
         """Return (V,) bool: which voxels have votes."""
-        return self.hit | (self._tally.free[:-1] > 0)
+        return self.hit | (self.free > 0)
 
     def votes(self, *, copy: bool = True) -> Votes:
         """Return the votes so far.
@@ -333,7 +324,7 @@ class Ballot:
         candidates = self._tally.candidates[: self._tally.used[0]]
         occupied = np.empty(len(candidates), OCCUPIED_DTYPE)
         kernel.collect(self._tally.heads, candidates, occupied)
-        free = self._tally.free[:-1].reshape(self.spec.size)
+        free = self.free.reshape(self.spec.size)
         boxes = self._boxes.copy() if copy and self._boxes is not None else self._boxes
         return Votes(self.spec, self.classes, free.copy() if copy else free, occupied, boxes)
 

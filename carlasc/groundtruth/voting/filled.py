@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from carlasc.core.arrays import Uint8Array, Uint16Array
-from carlasc.core.cells import Cells, transform
+from carlasc.core.arrays import Float32Array, Uint8Array, Uint16Array
+from carlasc.core.cells import Cells, Pose, transform
 from carlasc.core.compiling import cached
-from carlasc.groundtruth.voting.kernel import ANYWHERE, Voters
 
 STEPS = 256  # number of steps of a box along an edge of a voxel
 
@@ -24,38 +23,36 @@ def no_boxes(num_voxels: int) -> Uint8Array:
 
 @cached
 def widen_boxes(
-    cast: Voters, cells: Cells, region: int, regions: Uint16Array, boxes: Uint8Array
+    points: Float32Array,
+    pose: Pose,
+    cells: Cells,
+    regions: Uint16Array,
+    region: int,
+    boxes: Uint8Array,
 ) -> None:
-    """Widen the boxes of Cartesian voxels by the points of an observation that vote for their
-    classes.
+    """Widen the boxes of Cartesian voxels by points.
 
     Args:
-        cast: the observation.
+        points: (3, N) metres.
+        pose: grid_T_points.
         cells: the cells of the grid.
-        region: region in which points vote, or ANYWHERE.
-        regions: (V + 1,) region of each voxel; empty if the grid has none.
+        regions: (V,) region of each voxel; empty: all voxels count.
+        region: the region whose voxels count.
         boxes: (V, 6) uint8; widened: first and last x, y, z in 1/256 of a voxel, from its lower
             corner.
     """
     # The rule of `find_voxel`, whose quotients are needed here too. Points that rounding puts
     # beyond the last cell widen no box.
-    points, labels, hits, _, _, poses, ends = cast
-    scaled, begin = np.empty(3), 0
-    for place in range(len(ends)):
-        p = poses[place]
-        pose = (p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11])
-        for i in range(begin, ends[place]):
-            if labels[i] == 0 or (len(hits) and not hits[i]):
-                continue
-            at = transform(pose, points[3 * i], points[3 * i + 1], points[3 * i + 2])
-            voxel, inside = 0, True
+    scaled = np.empty(3)
+    for i in range(points.shape[1]):
+        at = transform(pose, points[0, i], points[1, i], points[2, i])
+        voxel, inside = 0, True
+        for axis in range(3):
+            scaled[axis] = (at[axis] - cells.lower[axis]) / cells.voxel_size[axis]
+            inside &= 0 <= scaled[axis] < cells.size[axis]
+            voxel = voxel * cells.size[axis] + int(scaled[axis])
+        if inside and (len(regions) == 0 or regions[voxel] == region):
             for axis in range(3):
-                scaled[axis] = (at[axis] - cells.lower[axis]) / cells.voxel_size[axis]
-                inside &= 0 <= scaled[axis] < cells.size[axis]
-                voxel = voxel * cells.size[axis] + int(scaled[axis])
-            if inside and (region == ANYWHERE or regions[voxel] == region):
-                for axis in range(3):
-                    step = np.uint8((scaled[axis] - int(scaled[axis])) * STEPS)
-                    boxes[voxel, axis] = min(boxes[voxel, axis], step)
-                    boxes[voxel, 3 + axis] = max(boxes[voxel, 3 + axis], step)
-        begin = ends[place]
+                step = np.uint8((scaled[axis] - int(scaled[axis])) * STEPS)
+                boxes[voxel, axis] = min(boxes[voxel, axis], step)
+                boxes[voxel, 3 + axis] = max(boxes[voxel, 3 + axis], step)

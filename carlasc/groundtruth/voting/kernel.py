@@ -1,5 +1,5 @@
-"""The compiled loops of voting: they add the votes of one observation, and collect the counted
-votes.
+"""The compiled loops of voting: they add the votes of one observation, or of points without rays,
+and collect the counted votes.
 
 Rays are processed in blocks. The vectorised code of rays.py clips them to the grid and finds the
 voxels of their samples. Where rounding could change the voxel, the exact rule finds it. Votes for
@@ -15,7 +15,6 @@ import numpy as np
 
 from carlasc.core.arrays import (
     AnyArray,
-    BoolArray,
     Float32Array,
     FloatArray,
     Int32Array,
@@ -23,7 +22,7 @@ from carlasc.core.arrays import (
     Uint8Array,
     Uint16Array,
 )
-from carlasc.core.cells import Cells, Pose, transform
+from carlasc.core.cells import Cells, Pose, find_voxel, pose_of, transform
 from carlasc.core.compiling import cached, inlined, jit
 from carlasc.groundtruth.voting.rays import (
     CHUNK,
@@ -47,9 +46,6 @@ from carlasc.groundtruth.voting.rays import (
 
 BLOCK = 256  # number of rays whose coordinates fit into the L1 cache
 NONE = -1  # end of a voxel's list of candidates
-ANYWHERE = -1  # region of votes that count in all regions
-NOT_AT_ALL = -2  # region of rays that do not vote
-OUTSIDE = np.iinfo(np.uint16).max  # region of samples outside the grid
 
 CANDIDATE_DTYPE = np.dtype(
     [
@@ -67,6 +63,11 @@ CANDIDATE_DTYPE = np.dtype(
 of its votes, and the next candidate.
 """
 
+HIT_DTYPE = np.dtype([("votes", np.int32), ("voters", np.uint16), ("last", np.uint16)])
+"""The votes of a voxel for a class, the number of their voters, and the last voter. It is small, as
+there is one for each voxel: a window has less than 65,536 scans.
+"""
+
 
 class Tally(NamedTuple):
     """The votes of V voxels.
@@ -79,12 +80,6 @@ class Tally(NamedTuple):
         heads: (V,) int32, index of the first candidate of each voxel, or NONE.
         candidates: (C,) CANDIDATE_DTYPE, the candidates of all voxels.
         used: (1,) int64, number of candidates in use.
-        regions: (V + 1,) uint16, region of each voxel, and OUTSIDE for the last element; empty if
-            the grid has no regions.
-        views: (V + 1,) uint16, number of observations that saw each voxel; empty if they are not
-            counted.
-        viewers: (V + 1,) int32, the last observation that saw each voxel, or NONE; empty if views
-            are not counted.
     """
 
     once: bool
@@ -93,9 +88,6 @@ class Tally(NamedTuple):
     heads: Int32Array
     candidates: AnyArray
     used: IntArray
-    regions: Uint16Array
-    views: Uint16Array
-    viewers: Int32Array
 
 
 class Voters(NamedTuple):
@@ -105,77 +97,21 @@ class Voters(NamedTuple):
         points: (3 N,) float32, metres, x, y, z of each point from the origin of its ray, on the
             axes of the sensor.
         labels: (N,) uint16; points labelled 0 and their rays do not vote.
-        hits: (N,) bool, points that vote for their class; empty: all.
-        sure: (N,) float32, probability of these classes; empty: 1.
-        weights: (N,) uint8, votes of each point and of each sample of its ray; empty: 1, as with
-            `Tally.once`.
         poses: (K, 12) grid_T_place of the origins of rays; each one is a voter.
         ends: (K,) index after the last point of each origin.
     """
 
     points: Float32Array
     labels: Uint16Array
-    hits: BoolArray
-    sure: Float32Array
-    weights: Uint8Array
     poses: FloatArray
     ends: IntArray
 
 
 @inlined
-def count_view(voxel: int, voter: int, tally: Tally) -> None:
-    """Count a view of a voxel, at most one per observation, if views are counted."""
-    if len(tally.views) and tally.viewers[voxel] != voter:
-        tally.viewers[voxel] = voter
-        tally.views[voxel] += np.uint16(1)
-
-
-@jit
-def vote_occupied(
-    points: Float32Array,
-    labels: Uint16Array,
-    hits: BoolArray,
-    sure: Float32Array,
-    weights: Uint8Array,
-    rays: RayBlock,
-    voxels: Int32Array,
-    pose: Pose,
-    cells: Cells,
-    voter: int,
-    region: int,
-    tally: Tally,
-) -> None:
-    """Add the votes of the points of a block for their classes, in the voxels of a region; `hits`
-    chooses points, unless it is empty.
-    """
-    # `entry` is the candidate of the pair (last, label) for which the point before voted.
-    entry, last, label = 0, NONE, np.uint16(0)
-    for i in range(len(labels)):
-        if rays.state[i] == DROPPED or (len(hits) and not hits[i]):
-            continue
-        voxel = voxels[i]
-        if voxel == DOUBTFUL or rays.state[i] == UNSURE:
-            _, voxel = sample_voxel(
-                points[3 * i], points[3 * i + 1], points[3 * i + 2], 0.0, 0.0, pose, cells
-            )
-        if voxel < len(tally.heads) and (region == ANYWHERE or tally.regions[voxel] == region):
-            weight = int(weights[i]) if len(weights) else 1
-            if voxel != last or labels[i] != label:
-                last, label = voxel, labels[i]
-                entry = vote_for(voxel, label, weight, voter, tally)
-                count_view(voxel, voter, tally)
-            elif not tally.once:  # neighbouring points are often in one voxel
-                tally.candidates[entry].votes += weight
-            # The doubt is summed, not the certainty: it is 0 for labels without probabilities.
-            if len(sure):
-                tally.candidates[entry].doubt += np.float32(weight) * (np.float32(1) - sure[i])
-
-
-@inlined
-def vote_for(voxel: int, label: int, weight: int, voter: int, tally: Tally) -> int:
-    """Add votes for a class to a voxel, and return the index of its candidate."""
-    candidates = tally.candidates
-    entry = tally.heads[voxel]
+def find_candidate(voxel: int, label: int, tally: Tally) -> int:
+    """Return the index of the candidate of a class in a voxel, which is made if there is none."""
+    heads, candidates = tally.heads, tally.candidates
+    entry = heads[voxel]
     while entry != NONE and candidates[entry].label != label:
         entry = candidates[entry].next
     if entry == NONE:
@@ -186,44 +122,76 @@ def vote_for(voxel: int, label: int, weight: int, voter: int, tally: Tally) -> i
         candidates[entry].voxel = voxel
         # A new candidate becomes the head of the list: classes seen last are looked up first, and
         # points that follow each other often have one class.
-        candidates[entry].next = tally.heads[voxel]
+        candidates[entry].next = heads[voxel]
         candidates[entry].voter = NONE
         candidates[entry].label = label
-        tally.heads[voxel] = entry
-    # A sum of conditions instead of the branch would make the whole kernel 1.5 times slower.
-    if not tally.once or candidates[entry].voter != voter:
-        candidates[entry].votes += weight
-        candidates[entry].voters += candidates[entry].voter != voter
-        candidates[entry].voter = voter
-    return int(entry)
+        heads[voxel] = entry
+    return entry
+
+
+@jit
+def vote_occupied(
+    points: Float32Array,
+    labels: Uint16Array,
+    rays: RayBlock,
+    voxels: Int32Array,
+    pose: Pose,
+    cells: Cells,
+    voter: int,
+    tally: Tally,
+) -> None:
+    """Add the votes of the points of a block for their classes."""
+    # `entry` is the candidate of the pair (last, label) for which the point before voted, and
+    # `more` its votes that are not written yet: neighbouring points are often in one voxel.
+    # Arrays are taken out of the tuples once: Numba counts a reference each time.
+    heads, candidates, states, once = tally.heads, tally.candidates, rays.state, tally.once
+    entry, last, label, more = 0, NONE, np.uint16(0), 0
+    for i in range(len(labels)):
+        if states[i] == DROPPED:
+            continue
+        voxel = voxels[i]
+        if voxel == DOUBTFUL or states[i] == UNSURE:
+            _, voxel = sample_voxel(
+                points[3 * i], points[3 * i + 1], points[3 * i + 2], 0.0, 0.0, pose, cells
+            )
+        if voxel >= len(heads):
+            continue
+        if voxel == last and labels[i] == label:
+            more += not once
+        else:
+            if more:
+                candidates[entry].votes += more
+            last, label, more = voxel, labels[i], 0
+            entry = find_candidate(voxel, label, tally)
+            # A sum of conditions instead of the branch would make the kernel 1.5 times slower.
+            if not once or candidates[entry].voter != voter:
+                candidates[entry].votes += 1
+                candidates[entry].voters += candidates[entry].voter != voter
+                candidates[entry].voter = voter
+    if more:
+        candidates[entry].votes += more
 
 
 @jit
 def vote_free(
     points: Float32Array,
     labels: Uint16Array,
-    weights: Uint8Array,
     rays: RayBlock,
     pose: Pose,
     view: GridView,
     cells: Cells,
     free_step_m: float,
-    voter: int,
-    region: int,
-    counted: int,
     tally: Tally,
 ) -> None:
     """Add the votes of the free samples of a block, which lie between the sensor and the points.
 
-    If each sample counts, those in the region `counted` are added; otherwise all are marked in
-    `passed`. Views count in `region`.
+    Each sample is added, or marked in `passed` if an observation has one vote per voxel.
     """
     voxels = np.empty(CHUNK, np.int32)
     for i in range(len(labels)):
-        weight = np.uint32(weights[i]) if len(weights) else np.uint32(1)
         if rays.state[i] == UNSURE:
             point = points[3 * i], points[3 * i + 1], points[3 * i + 2]
-            vote_free_by_rule(point, weight, pose, view, cells, free_step_m, counted, tally)
+            vote_free_by_rule(point, pose, view, cells, free_step_m, tally)
         if rays.state[i] != SURE:
             continue
         x, y, z, dx, dy, dz = rays.x[i], rays.y[i], rays.z[i], rays.dx[i], rays.dy[i], rays.dz[i]
@@ -256,29 +224,19 @@ def vote_free(
             if tally.once:
                 for j in range(number):
                     tally.passed[np.uint32(voxels[j])] = 1
-            elif counted == ANYWHERE:
-                for j in range(number):
-                    tally.free[np.uint32(voxels[j])] += weight
             else:
                 for j in range(number):
-                    if tally.regions[np.uint32(voxels[j])] == counted:
-                        tally.free[np.uint32(voxels[j])] += weight
-            if len(tally.views):
-                for j in range(number):
-                    if region == ANYWHERE or tally.regions[voxels[j]] == region:
-                        count_view(voxels[j], voter, tally)
+                    tally.free[np.uint32(voxels[j])] += np.uint32(1)
             step += CHUNK
 
 
 @jit
 def vote_free_by_rule(
     point: tuple[np.float32, np.float32, np.float32],
-    weight: np.uint32,
     pose: Pose,
     view: GridView,
     cells: Cells,
     free_step_m: float,
-    region: int,
     tally: Tally,
 ) -> None:
     """Add the votes of the free samples of one ray by the exact rule, clipped to the grid with a
@@ -304,22 +262,13 @@ def vote_free_by_rule(
         kept, voxel = sample_voxel(x, y, z, step, free_step_m, pose, cells)
         if tally.once:
             tally.passed[voxel] = 1
-        elif region == ANYWHERE or tally.regions[voxel] == region:
-            tally.free[voxel] += weight
+        else:
+            tally.free[voxel] += np.uint32(1)
         step += 1.0
 
 
 @cached
-def vote(
-    cast: Voters,
-    cells: Cells,
-    free_step_m: float,
-    voter: int,
-    hit_region: int,
-    free_region: int,
-    apart: IntArray,
-    tally: Tally,
-) -> None:
+def vote(cast: Voters, cells: Cells, free_step_m: float, voter: int, tally: Tally) -> None:
     """Add the votes of one observation.
 
     Args:
@@ -327,19 +276,12 @@ def vote(
         cells: the cells of the grid.
         free_step_m: distance between two free samples, metres.
         voter: number of the first voter.
-        hit_region: region in which points vote, or ANYWHERE.
-        free_region: region in which rays vote, ANYWHERE, or NOT_AT_ALL.
-        apart: (A,) voxels outside of `free_region`, if they are few: their votes are counted and
-            then restored, which is faster. Or empty.
         tally: the votes so far, with room for N more candidates.
     """
-    points, labels, hits, sure, weights, poses, ends = cast
+    points, labels, poses, ends = cast
     rays, voxels, begin = empty_rays(BLOCK), np.empty(BLOCK, np.int32), 0
-    # The votes of the voxels of `apart` before this observation.
-    kept = tally.free[apart]
     for place in range(len(ends)):
-        p = poses[place]
-        pose = (p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11])
+        pose = pose_of(poses, place)
         view = view_from(pose, cells)
         # Blocks fit into the cache: what one of the passes over a block writes, the next one reads.
         while begin < ends[place]:
@@ -347,43 +289,104 @@ def vote(
             corner, block = points[3 * begin : 3 * end], labels[begin:end]
             clip(corner, block, free_step_m, view, rays)
             place_points(rays, view, voxels[: end - begin])
-            own, likely, count = hits[begin:end], sure[begin:end], weights[begin:end]
-            now = voter + place
-            vote_occupied(
-                corner, block, own, likely, count, rays, voxels, pose, cells, now, hit_region, tally
-            )
-            if free_region != NOT_AT_ALL:
-                counted = ANYWHERE if len(apart) else free_region
-                vote_free(
-                    corner,
-                    block,
-                    count,
-                    rays,
-                    pose,
-                    view,
-                    cells,
-                    free_step_m,
-                    now,
-                    free_region,
-                    counted,
-                    tally,
-                )
+            vote_occupied(corner, block, rays, voxels, pose, cells, voter + place, tally)
+            vote_free(corner, block, rays, pose, view, cells, free_step_m, tally)
             begin = end
         if tally.once:
-            count_passed(free_region, tally)
-    for i in range(len(apart)):
-        tally.free[apart[i]] = kept[i]
+            for v in range(len(tally.passed)):
+                tally.free[v] += tally.passed[v]
+                tally.passed[v] = 0
 
 
-@jit
-def count_passed(region: int, tally: Tally) -> None:
-    """Add one vote for free space to each voxel of a region that the observation saw free."""
-    if region != ANYWHERE:
-        for v in range(len(tally.passed)):
-            tally.passed[v] &= np.uint8(tally.regions[v] == region)
-    for v in range(len(tally.passed)):
-        tally.free[v] += tally.passed[v]
-        tally.passed[v] = 0
+@cached
+def count_hits(
+    points: Float32Array,
+    sure: Float32Array,
+    pose: Pose,
+    cells: Cells,
+    voter: int,
+    hits: AnyArray,
+    doubt: Float32Array,
+    hit: Int32Array,
+    number: int,
+) -> int:
+    """Count the points of one class of one voter, and return the number of voxels with votes.
+
+    Most voxels have points of many scans. A dense count finds them faster than lists of candidates.
+
+    Args:
+        points: (3, N) metres.
+        sure: (N,) probability of the class of each point; empty: 1.
+        pose: grid_T_points.
+        cells: the cells of the grid.
+        voter: number of the voter, from 1: `last` is 0 without one.
+        hits: (V + 1,) HIT_DTYPE, 0 without votes; the last element counts points outside.
+        doubt: (V + 1,) the summed doubt; empty if all classes are certain.
+        hit: (N,) the voxels with votes, in the order of their first votes.
+        number: how many of them there were before.
+    """
+    view, voxels, begin = view_from(pose, cells), np.empty(BLOCK, np.int32), 0
+    xs, ys, zs = points[0], points[1], points[2]
+    doubts, own = len(sure) > 0, np.uint16(voter)
+    while begin < len(xs):
+        # Places of a block first, in vectorised code.
+        size = min(BLOCK, len(xs) - begin)
+        if view.cylindrical:
+            for i in range(size):
+                x, y, z = transform(view.pose, xs[begin + i], ys[begin + i], zs[begin + i])
+                voxels[i] = place_cylindrical(x, y, z, view)
+        else:
+            for i in range(size):
+                x, y, z = transform(view.pose, xs[begin + i], ys[begin + i], zs[begin + i])
+                voxels[i] = place_cartesian(x, y, z, view)
+        for i in range(size):
+            voxel = voxels[i]
+            if voxel == DOUBTFUL:
+                x, y, z = transform(pose, xs[begin + i], ys[begin + i], zs[begin + i])
+                voxel = find_voxel(x, y, z, cells)
+            if hits[voxel].votes == 0:
+                hit[number] = voxel
+                number += 1
+            hits[voxel].votes += 1
+            hits[voxel].voters += hits[voxel].last != own
+            hits[voxel].last = own
+            # The doubt is summed, not the certainty: it is 0 for labels without probabilities.
+            if doubts:
+                doubt[voxel] += np.float32(1) - sure[begin + i]
+        begin += size
+    return number
+
+
+@cached
+def add_hits(
+    label: int,
+    hits: AnyArray,
+    doubt: Float32Array,
+    hit: Int32Array,
+    regions: Uint16Array,
+    region: int,
+    tally: Tally,
+) -> None:
+    """Add the counted votes to the candidates, for which there must be room, and clear them.
+
+    Args:
+        label: the class.
+        hits: (V + 1,) HIT_DTYPE.
+        doubt: (V + 1,) the summed doubt, or empty.
+        hit: (N,) the voxels that have votes.
+        regions: (V,) region of each voxel; empty: all voxels count.
+        region: the region whose voxels count.
+        tally: the votes so far.
+    """
+    for voxel in hit:
+        if voxel < len(tally.heads) and (len(regions) == 0 or regions[voxel] == region):
+            entry = find_candidate(voxel, label, tally)
+            candidate = tally.candidates[entry]
+            candidate.votes += hits[voxel].voters if tally.once else hits[voxel].votes
+            candidate.voters += hits[voxel].voters
+            candidate.doubt += doubt[voxel] if len(doubt) else np.float32(0)
+            candidate.voter = NONE  # the next observation is another voter
+        hits[voxel].votes = hits[voxel].voters = hits[voxel].last = 0
 
 
 @cached

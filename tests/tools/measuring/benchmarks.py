@@ -73,13 +73,13 @@ FILES: dict[str, dict[str, Row]] = {
         for kind in ("grid", "and evidence")
     }
     | {
-        f"test_a_frame_with_a_part_of_the_rays[{res}-{rays}-turning]": Row(
-            f"merging.{name}.{rays}",
+        f"test_a_frame_after_the_one_before[{res}-{kind}]": Row(
+            f"merging.{name}.{kind}",
             "ms",
-            f"a frame from 31 merged scans at {res} m, rays from 20 places, {rays}",
+            f"a frame from 21 merged scans at {res} m after the one before, {kind}",
         )
         for res, name in ((0.4, "coarse"), (0.2, "fine"))
-        for rays in ("all", "enough")
+        for kind in ("consecutive", "turning")
     }
     | {
         "test_the_pass_that_finds_what_moves": Row(
