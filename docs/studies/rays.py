@@ -36,7 +36,7 @@ def main() -> None:
     with study.begin(parser) as given:
         before = json.loads(given.before.read_text()) if given.before else {}
         found: dict[str, dict[str, float]] = {}
-        row = BY_NAME["align, evidence"]
+        row = BY_NAME["align, free space"]
         for kind, seed in study.drives(given, SEEDS):
             for drive in record(kind, seed, CHANNELS, given.work):
                 references = reference(kind, seed, given.work)
