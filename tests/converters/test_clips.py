@@ -107,8 +107,7 @@ def interrupt(*arguments: object) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("is_served", [False, True])
-@pytest.mark.parametrize("is_killed", [False, True])
+@pytest.mark.parametrize(("is_served", "is_killed"), [(False, False), (True, True)])
 def test_a_clip_that_changed_is_converted_again(tmp_path, is_served, is_killed, monkeypatch):
     files, out = write_clips(tmp_path / "in", 2), tmp_path / "out"
     path = listed(tmp_path, *files)

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from carlasc.core.arrays import AnyArray, Float32Array, IntArray
-from carlasc.errors import FormatError
+from carlasc.errors import FormatError, within
 from carlasc.storage.arrays import check_size
 from carlasc.storage.files import damaged
 from carlasc.storage.packed.array_fields import ArrayField
@@ -142,7 +142,8 @@ class ArraySequence(PackedSequence[ArrayField]):
         """Return the files that hold a field of some frames: shards of a zarr store, the one file
         of an HDF5 store.
         """
-        return self._field(field).files_of(list(frames))
+        with within(self.location):
+            return self._field(field).files_of(list(frames))
 
     def published_bytes(self, field: str) -> int:
         """Return the size of the published files of a field, from the numbers of elements."""

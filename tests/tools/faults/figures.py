@@ -68,8 +68,8 @@ KINDS = {
     "changes": Kind(
         "faults.changes",
         "changed inputs",
-        "An input of a finished command changes (values, length, removed, text, time only), and the "
-        "command runs again: the result is that of a run into an empty folder, or the run is "
+        "An input of a finished or killed command changes (values, length, removed, text, time only), "
+        "and the command runs again: the result is that of a run into an empty folder, or the run is "
         "refused",
         200,
         5_000,
@@ -77,7 +77,7 @@ KINDS = {
     "large": Kind(
         "faults.large",
         "commands on large data",
-        "Frames, sequences, points of a scan and voxels double twice: in the second doubling, an "
+        "Frames, sequences, seconds, points of a scan and voxels double twice: in the second doubling, an "
         "item costs no more time and memory than in the first",
         1,
         1_000,

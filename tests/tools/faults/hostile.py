@@ -113,7 +113,7 @@ def run(count: int, seed: int, folder: Path) -> Outcome:
 
 _OTHERS = {
     "view": "view {} -o out.html",
-    "map": "map {} out.ply --workers 1",
+    "map": "map {} out/map.ply --workers 1",
     "label": "label {} -o out --from motion --workers 1",
     "refine": "refine {} -o out --workers 1",
     "audit": "audit {} {} --keep out --workers 1",
