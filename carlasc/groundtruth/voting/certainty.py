@@ -392,19 +392,26 @@ def _compare(cast: _Cast, confusion: FloatArray, frequency: FloatArray) -> None:
         most[i] = own[best]
         frequency[most[i]] += 1
     for i in range(len(voxels)):
-        total = weight[begins[i] : begins[i + 1]].sum()
-        around = 0
-        for x in range(-1, 2):
-            for y in range(-1, 2):
-                for z in range(-1, 2):
-                    other = _neighbour(cast, i, x, y, z)
-                    if other >= 0:  # counts the voxel itself too
-                        # -27 outweighs all others: one neighbour of another class is a border,
-                        # where the errors of positions look like errors of labels
-                        around += 1 if most[other] == most[i] else -27
-        if total >= _MIN_SCANS and around >= 3:
+        if weight[begins[i] : begins[i + 1]].sum() >= _MIN_SCANS and _is_inside(cast, i, most):
             for row in range(begins[i], begins[i + 1]):
                 confusion[most[i], own[row]] += weight[row]
+
+
+@jit
+def _is_inside(cast: _Cast, i: int, most: IntArray) -> bool:
+    """Return whether at least two neighbours of a voxel have votes, all most for its class."""
+    around = 0
+    for x in range(-1, 2):
+        for y in range(-1, 2):
+            for z in range(-1, 2):
+                other = _neighbour(cast, i, x, y, z)
+                if other >= 0:  # counts the voxel itself too
+                    # One neighbour of another class is a border, where the errors of positions look
+                    # like errors of labels.
+                    if most[other] != most[i]:
+                        return False
+                    around += 1
+    return around >= 3
 
 
 @cached
