@@ -149,7 +149,76 @@ def draw_grids() -> bytes:
     return _png(draw_panels(panels, size=(1500, 470)))
 
 
+def draw_steps() -> bytes:
+    """What goes in, the steps of the method, and what comes out."""
+    figure, (axes,) = _canvas(1, (6.4, 5.6), [1])
+    rows = (
+        (5, "#dce9f5", ["bag", "folder of\nscans", "11 data\nsets", "simulated\ntown", "CARLA"]),
+        (4, "#f2f2f2", ["one layout: scans, poses, labels, boxes (checked)"]),
+        (3, "#f7e6cf", ["poses refined", "moving actors\nfound", "actors followed\nand completed"]),
+        (2, "#f7e6cf", ["rays of all scans vote: class, free or unknown per voxel"]),
+        (
+            1,
+            "#d9ecd9",
+            ["training\nsamples", "clean\nmap", "audit,\nscores", "page,\nfilm", "card"],
+        ),
+    )
+    for row, color, texts in rows:
+        width = 10 / len(texts)
+        for place, text in enumerate(texts):
+            axes.add_patch(
+                _rectangle(
+                    (place * width + 0.1, row * 1.75),
+                    width - 0.2,
+                    1.15,
+                    facecolor=color,
+                    edgecolor=INK,
+                )
+            )
+            axes.text(
+                (place + 0.5) * width, row * 1.75 + 0.57, text, color=INK, ha="center",
+                va="center", fontsize=11,
+            )  # fmt: skip
+        if row > 1:
+            _arrow(axes, (5, row * 1.75), (5, row * 1.75 - 0.6), INK, "", (0, 0))
+    axes.set_xlim(0, 10)
+    axes.set_ylim(1.6, 10.0)
+    return _svg(figure)
+
+
+def draw_logo() -> bytes:
+    """The logo: three voxels, of which one is only an outline: it is unknown."""
+    faces = []
+    for at, colors in (
+        ((0, 0), ("#f2a65a", "#d9822b", "#b5651d")),
+        ((1, 0), ("#5b9bd5", "#2f74b5", "#1f5182")),
+        ((0.5, 1), None),
+    ):
+        x, y = 12 + 34.64 * at[0], 66 - 30 * at[1]
+        top = [(x, y), (x + 17.32, y - 10), (x + 34.64, y), (x + 17.32, y + 10)]
+        left = [top[0], top[3], (top[3][0], y + 30), (x, y + 20)]
+        right = [top[3], top[2], (top[2][0], y + 20), (top[3][0], y + 30)]
+        for place, corners in enumerate((top, left, right)):
+            points = " ".join(f"{a:.2f},{b:.2f}" for a, b in corners)
+            style = (
+                f'fill="{colors[place]}"'
+                if colors
+                else 'fill="none" stroke="#9aa5b1" stroke-width="2.5" stroke-linejoin="round"'
+            )
+            faces.append(f'<polygon points="{points}" {style}/>')
+    return "\n".join(
+        [
+            '<svg xmlns="http://www.w3.org/2000/svg" viewBox="6 20 82 82">',
+            "<title>carlasc</title>",
+            *faces,
+            "</svg>\n",
+        ]
+    ).encode()
+
+
 FIGURES: dict[str, Callable[[], bytes]] = {
+    "logo.svg": draw_logo,
+    "steps.svg": draw_steps,
     "frames.svg": draw_frames,
     "votes.svg": draw_votes,
     "town.png": draw_town,

@@ -14,6 +14,7 @@ import inspect
 import logging
 import re
 import sys
+import tomllib
 from collections.abc import Callable, Iterator
 from enum import Enum
 from pathlib import Path
@@ -25,6 +26,7 @@ from carlasc_converters.exporters.opensceneflow import CATEGORIES
 from mkdocs.structure.files import File
 from typer.models import ArgumentInfo, ParameterInfo
 
+import carlasc
 from carlasc import cli
 from carlasc.cli.flags import flatten
 from carlasc.core.benchmarks import IGNORED, TO_OCC3D, TO_SSCBENCH
@@ -47,21 +49,31 @@ PAGE_OF = {
     "scores": "evaluate",
 }
 # of a module
-_MEMBER = re.compile(r'<h3 id="(carlasc[\w.]*)\.(\w+)" class="doc doc-heading">\s*<code[^>]*>')
+_MEMBER = re.compile(r'<h2 id="(carlasc[\w.]*)\.(\w+)" class="doc doc-heading">\s*<code[^>]*>')
 # without a list of members
 _MODULE = re.compile(r"^::: (carlasc[\w.]*)$(?!\n    options:)", re.MULTILINE)
+_PICTURE = re.compile(r'(?<!">)<img [^>]*src="([^"]+)"[^>]*>')
+_SEARCH = {"api": 0.3, "studies": 0.6, "howto": 3.0, "commands": 1.5}  # folder -> its weight
+_PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())
+# empty until the first release
+_REPOSITORY: str = _PROJECT["tool"]["hatch"]["metadata"]["hooks"]["custom"]["repository"]
 _PLACE = re.compile(r"(<!-- generated: ([a-z-]+) -->\n).*?(<!-- generated end -->)", re.DOTALL)
 
 
 def on_config(config: Any) -> Any:
-    """Put the pages that a `folder/*` in the navigation stands for in its place."""
+    """Put the pages that a `folder/*` in the navigation stands for in its place; name the version,
+    and the repository once it has an address.
+    """
+    config.copyright = f"carlasc {carlasc.__version__}, MIT licence"
+    if _REPOSITORY:
+        config.repo_url, config.repo_name = _REPOSITORY, _REPOSITORY.partition("://")[2]
     config.nav = _expand(config.nav, Path(config.docs_dir), set(_pages(config.nav)))
     return config
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Leave scripts out of the site, and add the notebooks."""
-    for file in [file for file in files if file.src_uri.endswith(".py")]:
+    """Leave scripts and the theme out of the site, and add the notebooks."""
+    for file in [f for f in files if f.src_uri.endswith(".py") or f.src_uri.startswith("theme/")]:
         files.remove(file)
     for path, content in tutorials.pages():
         files.append(File.generated(config, path, content=content))
@@ -70,8 +82,12 @@ def on_files(files: Any, config: Any) -> Any:
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Fill in generated tables, whatever the page has in their places, and link the pages of the
-    notebooks.
+    notebooks; search finds guides before studies and the API.
     """
+    page.meta["search"] = {"boost": _SEARCH.get(page.file.src_uri.partition("/")[0], 1.0)}
+    if _REPOSITORY:
+        action = f"{_REPOSITORY.partition('://')[2].partition('/')[2]}@v{carlasc.__version__}"
+        markdown = markdown.replace("uses: ./carlasc", f"uses: {action}")
     markdown = _MODULE.sub(lambda match: match[0] + _members(match[1]), markdown)
     # they are pages of the site
     text = re.sub(r"\(\.\./examples/notebooks/(\w+)\.ipynb\)", r"(tutorials/\1.md)", markdown)
@@ -83,8 +99,9 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:
     """Give classes and functions the name by which they are imported, not that of the module that
-    holds them.
+    holds them; a click on a picture opens it in full.
     """
+    html = _PICTURE.sub(r'<a class="picture" href="\1">\g<0></a>', html)
     return _MEMBER.sub(lambda match: match[0] + _import_prefix(match[1], match[2]), html)
 
 

@@ -10,7 +10,7 @@ import pytest
 import carlasc.demo
 from carlasc.errors import DependencyError
 
-INDEX = Path(__file__).parents[1] / "docs/index.md"
+INDEX = Path(__file__).parents[1] / "docs/howto/install.md"
 
 
 def test_a_missing_package_is_named_with_the_size_of_the_extra_and_nothing_is_written(

@@ -26,7 +26,7 @@ from carlasc.converting import converter_names, exporter_names
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = {str(path.relative_to(DOCS)): path for path in sorted(DOCS.rglob("*.md"))}
-START = "index.md"
+START = "start.md"
 FENCE = re.compile(r"^```(\w+)([^\n]*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 END = "\x1e"  # between the outputs of two commands
 

@@ -71,9 +71,9 @@ def test_pictures_are_small_and_whole(gallery):
     assert sum(path.stat().st_size for path in gallery.IMAGES.iterdir()) < 6_000_000
 
 
-def test_the_readme_begins_with_the_film_of_the_drive():
+def test_the_readme_begins_with_a_picture_of_the_result():
     head = (ROOT / "README.md").read_text()[:1500]
-    assert "](docs/images/gallery/drive.webp)" in head
+    assert "](docs/images/traces.png)" in head
 
 
 def test_only_the_data_that_a_section_needs_are_made(gallery):

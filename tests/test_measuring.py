@@ -161,7 +161,7 @@ def test_numbers_that_nothing_writes_are_found(text: str, found: list[str] | Non
         (Figure(0.5843, "ms", "x"), "0.58 ms"),
         (Figure(9.53, "ms", "x"), "9.5 ms"),
         (Figure(0.6, "ms", "x"), "0.60 ms"),
-        (Figure(0.0, "%", "x"), "0 %"),
+        (Figure(0.0, "%", "x"), "0%"),
         (Figure(10.3, "", "x"), "10"),
         (Figure(139.1, "ms", "x"), "139 ms"),
         (Figure(3882.0, "ms", "x"), "3,880 ms"),

@@ -59,6 +59,7 @@ def test_notebooks_are_small_and_every_cell_has_run():
         nbformat.validate(notebook)
         code = [cell for cell in notebook.cells if cell.cell_type == "code"]
         assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1)), path.name
+        assert "%pip install" in code[0].source and 'find_spec("carlasc")' in code[0].source
         for cell in code:
             assert not any(
                 output.output_type == "error" or output.get("name") == "stderr"

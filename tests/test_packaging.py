@@ -105,7 +105,7 @@ def test_every_requirement_has_a_lowest_version():
 
 
 FOR_DEVELOPERS, SETS = {"dev", "docs", "study", "faults"}, {"all", "demo", "train", "convert"}
-HEAVY = {"torch", "view", "rerun", "carla"}  # gigabytes, and carla has few wheels
+HEAVY = {"torch", "view", "rerun", "ray", "carla"}  # large, and carla has few wheels
 
 
 def test_all_is_every_extra_but_sets_of_others_the_heavy_ones_and_those_of_developers():
@@ -115,9 +115,7 @@ def test_all_is_every_extra_but_sets_of_others_the_heavy_ones_and_those_of_devel
 
 
 def test_the_table_of_extras_names_each_and_nothing_that_is_none():
-    page = (
-        (ROOT / "docs" / "index.md").read_text().partition("## Extras")[2].partition("## Next")[0]
-    )
+    page = (ROOT / "docs" / "howto" / "install.md").read_text().partition("## Extras")[2]
     rows = re.findall(r"^\| (`.*?) \|", page, re.MULTILINE)
     assert set(re.findall(r"`([a-z0-9]+)`", " ".join(rows))) == set(
         PROJECT["optional-dependencies"]
@@ -139,15 +137,24 @@ def test_constraints_pin_what_the_tests_install_and_nothing_else():
     assert {name for name in needed if version(name).partition("+")[0] != pinned[name]} == set()
 
 
-def test_the_release_checklist_lists_the_relative_links_of_the_readme():
-    links = re.findall(r"\]\(([^)]+)\)", (ROOT / "README.md").read_text())
-    relative = {link for link in links if not link.startswith(("http", "#"))}
-    checklist = (ROOT / "docs" / "releasing.md").read_text()
-    listed = re.search(
-        r"<!-- relative links begin -->(.*)<!-- relative links end -->", checklist, re.DOTALL
-    )
-    assert set(re.findall(r"`([^`]+)`", listed[1])) == relative
+def test_links_of_the_readme_lead_to_the_repository_once_it_has_an_address(monkeypatch):
+    pytest.importorskip("hatchling")
+    monkeypatch.syspath_prepend(str(ROOT))
+    import hatch_build
+
+    readme, links = (ROOT / "README.md").read_text(), r"\]\(([^)]+)\)"
+    relative = {
+        link for link in re.findall(links, readme) if not link.startswith(("https://", "#"))
+    }
     assert all((ROOT / link.partition("#")[0]).is_file() for link in relative)
+    assert hatch_build.absolute(readme, "") == readme
+    made = hatch_build.absolute(readme, "https://host/org/carlasc")
+    assert {link for link in re.findall(links, made) if not link.startswith(("https://", "#"))} == (
+        set()
+    )
+    for link in relative:
+        assert re.search(rf"\]\(https://host/org/carlasc/(blob|raw)/main/{re.escape(link)}\)", made)
+    assert hatch_build.urls("") == {} and "Source" in hatch_build.urls("https://host/org/carlasc")
 
 
 def test_files_that_contributors_are_sent_to_exist():

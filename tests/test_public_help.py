@@ -16,7 +16,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 INSTALLED = re.findall(
     r"pip install '\.\[([a-z,]+)\]'",
-    "".join((ROOT / page).read_text() for page in ("README.md", "docs/index.md")),
+    "".join((ROOT / page).read_text() for page in ("README.md", "docs/index.md", "docs/start.md")),
 )
 SETS = sorted({tuple(sorted(extras.split(","))) for extras in INSTALLED} | {("all",)})
 ROOMS = sorted(path.parent.name for path in (ROOT / "carlasc").glob("*/__init__.py"))

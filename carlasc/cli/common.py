@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 _Number = TypeVar("_Number", int, float)
+_Row = TypeVar("_Row")
 
 MANY, WORST = 100, 10  # of more sequences or grids, sums and the worst are printed
 _LINE_S = 10.0  # time between two lines of progress without a terminal, seconds
@@ -111,6 +112,18 @@ Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace what an earlier run with other settings wrote.")
 ]
+
+
+def few(
+    rows: Iterable[_Row], badness: Callable[[_Row], Any] = lambda _: 0, *, everything: bool
+) -> list[_Row]:
+    """Return all rows; of more than 100 the ten worst (by default the first), unless everything is
+    wanted.
+    """
+    all_rows = [*rows]
+    if everything or len(all_rows) <= MANY:
+        return all_rows
+    return sorted(all_rows, key=badness, reverse=True)[:WORST]
 
 
 def starting_with(incomplete: str, names: Iterable[str]) -> list[str]:

@@ -252,13 +252,13 @@ def _print(result: Evaluation, other: Evaluation | None, output: OutputFlags) ->
         return
     if (interval := result.interval()) is not None:
         show(
-            f"mIoU {100 * interval.value:.2f}, 95 % interval {100 * interval.low:.2f} to "
+            f"mIoU {100 * interval.value:.2f}, 95% interval {100 * interval.low:.2f} to "
             f"{100 * interval.high:.2f} ({count(len(result.sequences), 'sequence')})"
         )
     if comparison is not None and other is not None:
         gain = comparison.difference
         show(
-            f"mIoU minus that of {other.name}: {100 * gain.value:+.2f}, 95 % interval "
+            f"mIoU minus that of {other.name}: {100 * gain.value:+.2f}, 95% interval "
             f"{100 * gain.low:+.2f} to {100 * gain.high:+.2f}, p = {comparison.p_value:.3g} "
             f"({count(len(comparison.sequences), 'sequence')})"
         )

@@ -173,9 +173,9 @@ class WorkFlags(Flags):
         str | None,
         typer.Option(
             metavar="WHERE",
-            help="Run on a Dask cluster: local or local:N (N processes on this machine), "
-            "tcp://HOST:PORT (a running scheduler), slurm (starts --workers jobs), or the dotted "
-            "path of a cluster class. Default: no cluster.",
+            help="Run on a cluster of Dask or Ray: local or local:N (N processes on this machine), "
+            "tcp://HOST:PORT or ray://HOST:PORT (one that runs), slurm (starts --workers jobs), or "
+            "the dotted path of a cluster class. Default: no cluster.",
         ),
     ] = None
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from carlasc.cli.common import MANY, WORST, Json, console, line, place_argument, print_json, show
+from carlasc.cli.common import MANY, Json, console, few, line, place_argument, print_json, show
 from carlasc.cli.library import Given, Library
 from carlasc.errors import count
 
@@ -36,10 +36,10 @@ def info(
     if as_json:
         print_json(overview.to_dict())
     else:
-        _print(overview)
+        _print(overview, everything=everything)
 
 
-def _print(overview: Overview) -> None:
+def _print(overview: Overview, *, everything: bool) -> None:
     from carlasc.cli.tables import print_table
 
     names = {name: number for name, number in overview.splits.items() if name != "none"}
@@ -53,51 +53,47 @@ def _print(overview: Overview) -> None:
         frames, taken = overview.total("frames"), overview.total("bytes")
         show(f"{count(sum(overview.places.values()), 'sequence')}{splits}")
         show(
-            f"{len(overview.sequences)} looked at (--all: all): in all {frames.value:,.0f} frames "
-            f"({frames.low:,.0f} to {frames.high:,.0f}), {_size(round(taken.value))} "
-            f"({_size(round(taken.low))} to {_size(round(taken.high))})"
+            f"{len(overview.sequences)} looked at (--all: all): in all "
+            f"{frames.text(lambda number: f'{number:,.0f}')} frames, {taken.text(_size)}"
         )
+        header = "Split|Fields|Axes|Classes|Sensor|Sequences|Frames"
+        print_table(header.split("|"), _rows_of_kinds(overview))
     elif overview.sequences:
         size = f", {_size(overview.bytes)}" if overview.bytes is not None else ""
         show(f"{count(len(overview.sequences), 'sequence')}{splits}{size}")
-        header = (
-            "Sequence",
-            "Frames",
-            "Numbers",
-            "Gaps",
-            "Fields",
-            "Grids",
-            "Axes",
-            "Classes",
-            "Size",
+        header = "Sequence|Frames|Numbers|Gaps|Fields|Grids|Axes|Classes|Size"
+        print_table(
+            header.split("|"), [_row(sequence) for sequence in overview.sequences], turn=False
         )
-        print_table(header, [_row(sequence) for sequence in overview.sequences], turn=False)
     bad = [sequence for sequence in overview.sequences if sequence.problem]
-    for sequence in bad[:WORST] if overview.places else bad:
+    for sequence in few(bad, everything=everything):
         show(f"{sequence.path or sequence.name}: {sequence.problem}")
     if kinds := _kinds_of_grids(overview):
-        header = (
-            "Grid",
-            "Coordinates",
-            "Voxels",
-            "Voxel size",
-            "Bounds",
-            "Fields",
-            "Sequences",
-            "Frames",
-            "Made",
-        )
-        print_table(header, [_grid_row(grids) for grids in kinds])
-    for sequence in overview.sequences:
-        for grid in sequence.grids:
-            if grid.stale:
-                show(f"{sequence.path or sequence.name}/{grid.name}: stale: {grid.stale}", "yellow")
+        header = "Grid|Coordinates|Voxels|Voxel size|Bounds|Fields|Sequences|Frames|Made"
+        print_table(header.split("|"), [_grid_row(grids) for grids in kinds])
+    stale = [
+        f"{sequence.path or sequence.name}/{grid.name}: stale: {grid.stale}"
+        for sequence in overview.sequences
+        for grid in sequence.grids
+        if grid.stale
+    ]
+    for text in few(stale, everything=everything):
+        show(text, "yellow")
     for capture in overview.captures:
         span = f"{capture.first}..{capture.last}" + (
             f" with {count(capture.gaps, 'gap')}" if capture.gaps else ""
         )
         size = f"{count(capture.sensors, 'sensor')}, {count(capture.frames, 'frame')}"
         show(f"raw capture {capture.path or '.'}: {size} ({span})")
+
+
+def _rows_of_kinds(overview: Overview) -> list[list[object]]:
+    """Return a row for each kind of sequence: what it has in common, and the sums."""
+    kinds: dict[tuple[object, ...], list[int]] = {}
+    for one in overview.sequences:
+        kind = (one.split or "none", ", ".join(one.fields), one.axes, one.classes, one.sensor)
+        kinds.setdefault(kind, []).append(one.frames)
+    return [[*kind, len(frames), sum(frames)] for kind, frames in kinds.items()]
 
 
 def _row(sequence: SequenceOverview) -> list[object]:
@@ -151,5 +147,5 @@ def _made(grid: GridOverview) -> str:
     )
 
 
-def _size(count: int) -> str:
+def _size(count: float) -> str:
     return f"{count / 1e9:.2f} GB" if count >= 1e8 else f"{count / 1e6:.2f} MB"

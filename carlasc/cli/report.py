@@ -9,10 +9,10 @@ import typer
 
 from carlasc.cli.common import (
     MANY,
-    WORST,
     Json,
     SourceArgument,
     echo,
+    few,
     file_option,
     print_json,
     report_failures,
@@ -67,16 +67,20 @@ def report(
 
 
 def _print(result: ReportResult, *, everything: bool) -> None:
+    from carlasc.cli.tables import print_table
     from carlasc.inspection.report_page import describe
 
-    shown = [*result.reports.items()]
-    if len(shown) > MANY and not everything:
-        frames = sum(len(one.frames) for _, one in shown)
-        known = sum(one.coverage.known for _, one in shown)
-        share = known / max(sum(one.coverage.voxels for _, one in shown), 1)
-        show(f"{len(shown)} grids, {frames:,} frames, {share:.1%} known; those with least known:")
-        shown = sorted(shown, key=lambda row: row[1].coverage.known_share)[:WORST]
-    for name, one in shown:
+    if result.places or (len(result.reports) > MANY and not everything):
+        title = ""
+        if result.places:
+            known = result.known().text(lambda share: f"{100 * share:.1f}")
+            title = f"a sample of {sum(result.places.values()):,} sequences: known % {known}"
+        splits = result.by_split()
+        sums = [[split, *values.values()] for split, values in splits.items()]
+        print_table(["sums of", *next(iter(splits.values()))], sums, title=title)
+    for name, one in few(
+        result.reports.items(), lambda row: -row[1].coverage.known_share, everything=everything
+    ):
         show(name, "bold")
         rows = describe(one)
         width = max(len(label) for label, _ in rows)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -11,6 +11,7 @@ from carlasc.cli.common import (
     Json,
     SourceArgument,
     echo,
+    few,
     file_option,
     print_json,
     report_failures,
@@ -49,6 +50,9 @@ def stats(
         Path | None,
         file_option("--plot", text="Also draw the histograms to this .png, .svg or .pdf file."),
     ] = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Print all sequences, not only the ten most unusual.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Count the classes of points and of known voxels, and compute class weights: as tables, a plot
@@ -65,13 +69,13 @@ def stats(
     if as_json:
         print_json(result.to_dict())
     else:
-        print_statistics(result, by)
+        print_statistics(result, by, everything=everything)
         if plot is not None:
             echo(f"plot: {plot}")
     report_failures(list(result.failures), result.frames + len(result.failures), "files")
 
 
-def print_statistics(result: Statistics, by: str = "split") -> None:
+def print_statistics(result: Statistics, by: str = "split", *, everything: bool = False) -> None:
     """Print the class tables; `carlasc demo` uses it too."""
     from carlasc.cli.tables import print_table
     from carlasc.core.classes import times
@@ -85,9 +89,11 @@ def print_statistics(result: Statistics, by: str = "split") -> None:
         print_table(header, rows, title=f"Classes of {classes.name}", turn=False)
     if by == "sequence":
         for kind in _KINDS:
-            header, rows = _sequence_table(result, kind)
+            header, rows = _sequence_table(result, kind, everything=everything)
             print_table(header, rows, title=f"{kind}, % by sequence")
     total = result.total
+    if result.places:
+        show(f"a sample of {sum(result.places.values()):,} sequences, with intervals of 95 %")
     show(f"classes: {', '.join(map(str, result.uses))}")
     if total.unlisted:
         ids = times(dict(sorted(total.unlisted.items())))
@@ -117,31 +123,50 @@ def _class_table(
         for histogram in splits.values()
         for kind in _KINDS
     ]
+    whole = [result.intervals(kind, remapped=remapped) if result.places else {} for kind in _KINDS]
     weights = result.weights() if remapped or result.remap is None else {}
     header += ["weight"] if weights else []
     rows = list[list[object]]()
     for name in classes.names.values():
         if any(counts[name] for counts in totals):
             cells = [
-                cell for counts in totals for cell in (f"{counts[name]:,}", _percent(counts, name))
+                cell
+                for counts, intervals in zip(totals, whole, strict=True)
+                for cell in (
+                    f"{counts[name]:,}",
+                    intervals[name].text(_write_percent) if intervals else _percent(counts, name),
+                )
             ]
             weight = [f"{weights[name]:.4f}"] if weights else []
             rows.append([name, *cells, *(_percent(counts, name) for counts in parts), *weight])
     return header, rows
 
 
-def _sequence_table(result: Statistics, kind: Kind) -> tuple[list[str], list[list[object]]]:
-    """Return a header and a row per sequence: the share of each class."""
-    names = list(_counts(result, result.total, kind, remapped=True))
-    rows = list[list[object]]()
+def _sequence_table(
+    result: Statistics, kind: Kind, *, everything: bool
+) -> tuple[list[str], list[list[object]]]:
+    """Return a header and a row per sequence: the share of each class. Of many sequences, those
+    whose shares differ most from the whole.
+    """
+    whole = _counts(result, result.total, kind, remapped=True)
+    usual = [_percent(whole, name) or 0 for name in whole]
+    rows = list[list[Any]]()
     for path, histogram in result.sequences.items():
         counts = _counts(result, histogram, kind, remapped=True)
-        rows.append([path or result.location, *(_percent(counts, name) for name in names)])
-    return ["Sequence", *names], rows
+        rows.append([path or result.location, *(_percent(counts, name) for name in whole)])
+
+    def distance(row: list[Any]) -> float:
+        return sum(abs((share or 0) - mean) for share, mean in zip(row[1:], usual, strict=True))
+
+    return ["Sequence", *whole], few(rows, distance, everything=everything)
 
 
 def _counts(result: Statistics, histogram: Histogram, kind: Kind, remapped: bool) -> dict[str, int]:
     return result.summed(histogram.of(kind)) if remapped else result.named(histogram.of(kind))
+
+
+def _write_percent(share: float) -> str:
+    return f"{100 * share:.2f}"
 
 
 def _percent(counts: dict[str, int], name: str) -> float | None:

@@ -12,9 +12,9 @@ import carlasc
 from carlasc.cli.common import (
     FAILED,
     MANY,
-    WORST,
     Json,
     SourceArgument,
+    few,
     print_json,
     report_failures,
     show,
@@ -135,21 +135,26 @@ def validate(
 
 def print_result(result: ValidationResult, *, everything: bool = False) -> None:
     """Print the findings by kind, errors first; `carlasc demo` uses it too."""
+    from carlasc.cli.tables import print_table
     from carlasc.inspection.findings import SEVERITIES, STATES
 
     for (severity, check), findings in result.grouped().items():
-        show(f"{severity}: {check} ({len(findings)})", _COLORS[severity])
+        about = f", in {result.sequences_with(findings).text(_whole)} sequences"
+        text = f"{severity}: {check} ({len(findings)}{about if result.places else ''})"
+        show(text, _COLORS[severity])
         shown = findings if everything else findings[:_SHOWN]
         for finding in shown:
             show(f"  {finding}")
         if len(findings) > len(shown):
             show(f"  ... and {len(findings) - len(shown)} more (--all prints them)")
-    reports, found = result.sequences, Counter(finding.sequence for finding in result.findings)
-    if len(reports) > MANY and not everything:
-        frames = sum(report.frames for report in reports)
-        show(f"{len(reports)} sequences, {count(frames, 'frame')}; those with most findings:")
-        reports = tuple(sorted(reports, key=lambda report: -found[report.path])[:WORST])
-    for report in reports:
+    found = Counter(finding.sequence for finding in result.findings)
+    if result.places or (len(result.sequences) > MANY and not everything):
+        if result.places:
+            show(f"a sample of {sum(result.places.values()):,} sequences")
+        splits = result.by_split()
+        rows = [[split, *sums.values()] for split, sums in splits.items()]
+        print_table(["sequences with", *next(iter(splits.values()))], rows, turn=False)
+    for report in few(result.sequences, lambda report: found[report.path], everything=everything):
         figures = [
             f"{share:.1%} of points in voxels of their class ({grid})"
             for grid, share in report.voxel_share.items()
@@ -179,6 +184,10 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
     show(f"{result.location}: {result.verdict} ({counts})", "bold")
 
 
+def _whole(number: float) -> str:
+    return f"{number:,.0f}"
+
+
 def print_held_out(result: HoldoutResult) -> None:
     """Print the scores of the held-out rays: of all sequences together, or of each if their classes
     differ.
@@ -196,10 +205,10 @@ def print_held_out(result: HoldoutResult) -> None:
     for name, scores in result.given_poses.items():
         shares = scores.all
         figures = {"free": shares.free, "unknown": shares.unknown, "occupied": shares.occupied}
-        text = ", ".join(f"{100 * (share or 0):.2f} % {where}" for where, share in figures.items())
+        text = ", ".join(f"{100 * (share or 0):.2f}% {where}" for where, share in figures.items())
         show(
             f"{name or result.location}: under the given poses: returns in {text} voxels; "
-            f"{100 * (shares.passed_object or 0):.2f} % of the rays pass through objects"
+            f"{100 * (shares.passed_object or 0):.2f}% of the rays pass through objects"
         )
     for name, fault in result.faults.items():
         if fault:
@@ -220,7 +229,7 @@ def _print_scores(title: str, scores: HeldOutScores) -> None:
         "Passed objects %",
         "Missed %",
         "Error m",
-        "90 % m",
+        "90% m",
     ]
     parts = {"all": scores.all, **scores.by_distance(), **scores.by_class()}
     print_table(header, [_row(name, one) for name, one in parts.items()], title=title, turn=False)

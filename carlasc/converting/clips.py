@@ -8,8 +8,10 @@ import os
 import re
 import shutil
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -40,6 +42,7 @@ from carlasc.storage.transport.remote_tree import RemoteTree, tree_of
 from carlasc.storage.transport.trees import is_url
 
 _BLOCK = 16 << 20  # bytes per request
+_WAIT_S = 0.1  # between two looks for room
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 
 
@@ -54,7 +57,7 @@ class Clips:
         convert: the function `convert`.
         arguments: its arguments, without source, output and run.
         scratch: folder for what is fetched.
-        most: largest size of the scratch, bytes.
+        most: largest size of the scratch, bytes; all processes of a machine together.
     """
 
     names: tuple[str, ...]
@@ -106,49 +109,89 @@ class Clips:
         return self.convert(source=place, out=self.out, run=run, **given)
 
     def _fetched(self, names: Iterable[str]) -> Iterator[tuple[str, Path | CarlascError]]:
-        """Yield the place of each clip on this machine, or why it cannot be fetched. It is deleted
-        before the next one is yielded.
+        """Yield the place of each clip on this machine, or why it cannot be fetched, while the next
+        one is fetched. It is deleted before the next one is yielded.
         """
         with ThreadPoolExecutor(1) as pool:
             ahead = None
             for name, later in pairwise([*names, ""]):
-                found = None if ahead is None else ahead.result()
-                place, held = found or self._fetch(name, self.most) or (Path(), 0)
-                ahead = pool.submit(self._fetch, later, self.most - held) if later else None
-                yield name, place
-                shutil.rmtree(self.scratch / combined(name), ignore_errors=True)
+                place, held = ahead.result() if ahead else self._fetch(name)
+                ahead = pool.submit(self._fetch, later) if later else None
+                try:
+                    yield name, place
+                finally:
+                    self._delete(held)
 
-    def _fetch(self, name: str, room: int) -> tuple[Path | CarlascError, int] | None:
-        """Return the place and the size of a clip, which is fetched if it is at a URL; None if it
-        needs more room.
-        """
+    def _fetch(self, name: str) -> tuple[Path | CarlascError, FileLock | None]:
+        """Return the place of a clip, which is fetched if it is at a URL, and the lock of it."""
         alone = is_url(name) or Path(name).is_absolute()
         url = name if alone else f"{self.source.rstrip('/')}/{name}"
         if not is_url(url):
-            return Path(url), 0
+            return Path(url), None
+        held = None
         try:
             tree = RemoteTree(url)
             sizes = tree.sizes()
             if not sizes:
                 raise MissingDataError(tree.location, expected="a clip", found="nothing")
-            total = sum(sizes.values())
-            if total > self.most:
+            if (total := sum(sizes.values())) > self.most:
                 expected = f"at most {self.most} bytes, the size of the scratch"
                 raise CarlascError(tree.location, expected=expected, found=str(total))
-            if total > room:
-                return None
             place = self.scratch / combined(name) / tree.location.rpartition("/")[2]
             with writing(place):
+                held = self._reserve(place, sizes)
                 for path, size in sizes.items():
-                    (place / path).parent.mkdir(parents=True, exist_ok=True)
-                    with (place / path).open("wb") as file:
+                    with (place / path).open("rb+") as file:
                         for at in range(0, size, _BLOCK):
                             file.write(tree.read_range(path, at, min(at + _BLOCK, size)))
         except StorageError:
             raise
         except CarlascError as error:
-            return error, 0
-        return place, total
+            return error, held
+        return place, held
+
+    def _reserve(self, place: Path, sizes: Mapping[str, int]) -> FileLock:
+        """Wait until this machine has room for the files of a clip, and make them; return a lock,
+        without which others delete them: their process died.
+        """
+        held = FileLock(f"{place.parent}.lock", thread_local=False)
+        while True:
+            with self._room():
+                self.scratch.mkdir(parents=True, exist_ok=True)
+                if not held.is_locked:
+                    held.acquire()
+                    shutil.rmtree(place.parent, ignore_errors=True)
+                taken = sum(map(_size, filter(Path.is_dir, self.scratch.iterdir())))
+                if taken + sum(sizes.values()) <= self.most:
+                    for path, size in sizes.items():
+                        (place / path).parent.mkdir(parents=True, exist_ok=True)
+                        with (place / path).open("wb") as file:
+                            file.truncate(size)
+                    return held
+            time.sleep(_WAIT_S)
+
+    def _delete(self, held: FileLock | None) -> None:
+        if held is not None:
+            with self._room():
+                shutil.rmtree(held.lock_file.removesuffix(".lock"), ignore_errors=True)
+                Path(held.lock_file).unlink(missing_ok=True)
+                held.release()
+                with suppress(OSError):  # others have clips in it
+                    self.scratch.rmdir()
+
+    def _room(self) -> FileLock:
+        return FileLock(f"{self.scratch}-room.lock")
+
+
+def _size(clip: Path) -> int:
+    """Return the size of a clip in the scratch, which is deleted if its process died."""
+    try:
+        with FileLock(f"{clip}.lock", timeout=0):
+            shutil.rmtree(clip)
+            Path(f"{clip}.lock").unlink()
+            return 0
+    except Timeout:
+        return sum(path.stat().st_size for path in clip.rglob("*") if path.is_file())
 
 
 def convert_clips(
@@ -187,8 +230,7 @@ def convert_clips(
     steps = StepCounter(run.progress, len(clips.names))
     run, results = replace(run, part=Part(), sequences_from=None, progress=None), list[Any]()
     if run.executor is not None:
-        one = max(most // run.processes, 1)
-        tasks = (replace(clips, names=(name,), most=one) for name in clips.names)
+        tasks = (replace(clips, names=(name,)) for name in clips.names)
         for done in run_all(_run_one, tasks, run, lost=_fail):
             results += done
             steps()
@@ -199,7 +241,6 @@ def convert_clips(
             for result in clips.run(pool):
                 results.append(result)
                 steps()
-            shutil.rmtree(folder, ignore_errors=True)
     except Timeout:
         advice = "wait for it, or set TMPDIR to another folder"
         raise ArgumentError(folder, expected="no other run", found="one", advice=advice) from None

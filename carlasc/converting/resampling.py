@@ -207,7 +207,7 @@ def resampling_notes(source: GridSpec, target: GridSpec, name: str) -> list[str]
             np.prod(np.maximum(high - low, 0)) / np.prod(np.subtract(target.upper, target.lower))
         )
         notes.append(
-            f"the grid {name} covers {100 * share:.0f} % of the volume that is written: the rest "
+            f"the grid {name} covers {100 * share:.0f}% of the volume that is written: the rest "
             f"is unknown"
         )
     return notes

@@ -286,7 +286,7 @@ class _ConvertedFrom:
         self._before = before = MadeFrom.read(plan.writer, _RECORD)
         if states is None:
             return
-        exists = len(plan.missing) < len(plan.recording.frames)
+        exists = bool(before.own) or len(plan.missing) < len(plan.recording.frames)
         is_other = before.own != states or _GAP in before.frames.values()
         if exists and (compare == "content" or is_other):
             plan.make_again(is_same=bool(before.own.items() & states.items()))

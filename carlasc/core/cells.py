@@ -163,6 +163,48 @@ def distinct(keys: IntArray) -> tuple[IntArray, IntArray]:
     return keys[first[order]], place[number]
 
 
+@cached
+def joined(keys: IntArray, seeds: BoolArray, width: int) -> IntArray:
+    """Return the component of each cell: seeds that touch are one component, and other cells belong
+    to a seed beside them; -1 without one.
+
+    Args:
+        keys: (C,) row times width plus column of each cell, increasing.
+        seeds: (C,) which cells are seeds.
+        width: columns per row.
+    """
+    # Union-find: every cell points towards the lowest cell of its component, so components have the
+    # same numbers whatever the order of joins. Half of the neighbours is enough: joins go both
+    # ways.
+    parent = np.arange(len(keys))
+    for i in range(len(keys)):
+        if not seeds[i]:
+            continue
+        for step in (1, width - 1, width, width + 1):
+            j = np.searchsorted(keys, keys[i] + step)
+            if j < len(keys) and keys[j] == keys[i] + step and seeds[j]:
+                a, b = i, j
+                while parent[a] != a:
+                    a = parent[a]
+                while parent[b] != b:
+                    b = parent[b]
+                parent[max(a, b)] = min(a, b)
+    component = np.full(len(keys), -1, np.int64)
+    for i in range(len(keys)):
+        if seeds[i]:
+            a = i
+            while parent[a] != a:
+                a = parent[a]
+            component[i] = a
+    for i in range(len(keys)):
+        if not seeds[i]:
+            for step in (-width - 1, -width, -width + 1, -1, 1, width - 1, width, width + 1):
+                j = np.searchsorted(keys, keys[i] + step)
+                if j < len(keys) and keys[j] == keys[i] + step and seeds[j]:
+                    component[i] = component[j]
+    return component
+
+
 @cached(error_model="python")
 def numbered(cells: IntArray) -> tuple[IntArray, IntArray]:
     """Number unique (N, K) cells in order of first occurrence, without sorting.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import types
 import typing
@@ -64,11 +65,14 @@ def _as_one_of(value: Any, kinds: tuple[Any, ...], name: str) -> Any:
     raise first or ValueError(f"{type(value).__name__} in {name}")
 
 
+_hints = functools.cache(typing.get_type_hints)
+
+
 def _as_record(value: Any, kind: Any, name: str) -> Any:
     """Convert an object to a dataclass, or to a mapping with the keys of a TypedDict."""
     if not isinstance(value, dict):
         raise ValueError(f"{type(value).__name__} in {name}")
-    hints = typing.get_type_hints(kind)
+    hints = _hints(kind)
     if missing := [key for key in hints if key not in value]:
         raise ValueError(f"no {missing[0]} in {name}")
     checked = {key: from_plain(value[key], hint, f"{name}.{key}") for key, hint in hints.items()}

@@ -32,7 +32,7 @@ def stack_visibility(
     A ray is sampled from its point back to the sensor, with the shortest edge of a voxel as step,
     so it may miss a voxel of which it crosses only a corner. If a scan has many more points than
     the outer surface of the grid has voxel faces (and more than 40,000), every N-th ray is traced.
-    On the published grid, this misses 4 % of the voxels that rays pass, and takes less than half
+    On the published grid, this misses 4% of the voxels that rays pass, and takes less than half
     the time.
 
     Args:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -417,7 +417,8 @@ class InputCheck:
         inputs.take_contents(contents)
         self._own = self._own_of(contents)
         self._whole = combined(sorted(self._own.items()), inputs.shared())
-        self.changed = self.must_record = bool(record.frames) and self._whole != record.whole
+        self.changed = self.must_record = bool(record.own) and self._whole != record.whole
+        self.gone = {int(frame) for frame in record.frames} - set(inputs.available())
         recorded = {frame: record.frames.get(str(frame)) for frame in existing}
         if not self.changed and all(recorded.values()):
             return
@@ -425,7 +426,6 @@ class InputCheck:
         if all(self._own.get(frame, own) == own for frame, own in record.own.items()):
             accepted = [frame for frame, made in recorded.items() if made == ACCEPTED]
             recorded |= {frame: self._made_from(frame) for frame in accepted}
-        self.gone = {int(frame) for frame in record.frames} - set(inputs.available())
         self.stale = {
             frame for frame, made in recorded.items() if made not in (None, self._made_from(frame))
         }
@@ -472,6 +472,15 @@ class InputCheck:
             f"record of what they were made from: {len(equal)} made again, {what}"
         )
 
+    def announce(self, numbers: Iterable[int]) -> None:
+        """List the frames of a new grid, before text files are written: if the run is killed then,
+        and the input loses frames, the next run removes their lines.
+        """
+        if self.inputs.files() is not None:
+            MadeFrom(frames={str(frame): "" for frame in sorted(numbers)}).create(
+                self.writer, self._name
+            )
+
     def begin(self, numbers: Collection[int], missing: Collection[int]) -> None:
         """Write the record of the frames that are about to be made, and remove those of which
         the input has no scan any more. The sequence is prepared.
@@ -487,7 +496,7 @@ class InputCheck:
         if self.gone:
             written = [f"{self.grid}/{part}" for part in layout.GRID_FIELDS]
             writer.remove_frames([*(layout.SCAN_FIELDS if is_copy else ()), *written], self.gone)
-        if self.changed and is_copy:
+        if (self.changed or self.gone) and is_copy:
             self._remove_others()
         for frame in self.gone:
             del record.frames[str(frame)]

@@ -341,7 +341,9 @@ def _begin(job: SequenceJob) -> None:
     writer, params = job.writer, layout.params_file(job.plan.grid)
     if job.replaces:
         writer.remove_grid(job.plan.grid)
-    if not writer.create_document(params, job.documents[params]):
+    if writer.create_document(params, job.documents[params]):
+        job.check.announce(job.numbers)
+    else:
         check_grid(writer, job.plan.grid, job.params, (), overwrite=False)
     for document, data in job.documents.items():
         if document != params:

@@ -28,8 +28,8 @@ from carlasc.storage.protocol import Sequence
 _DOUBTFUL_ACTORS = 0.25  # a greater share of doubtful actors is a warning
 
 # Share of the ground points within the other bounds of a grid. With the published bounds, it is 0.0
-# % on the simulated drives with flat ground, 2.6 % on average (6.6 % in one frame) on a real drive
-# with a sloping road, and 48 % on a drive whose sensor is 0.2 m too high for these bounds.
+# % on the simulated drives with flat ground, 2.6% on average (6.6% in one frame) on a real drive
+# with a sloping road, and 48% on a drive whose sensor is 0.2 m too high for these bounds.
 _SHARE = 0.1
 _LOWEST = 0.02  # share of the ground that may be below the advised bound
 

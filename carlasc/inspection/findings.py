@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
 
 from carlasc.errors import CarlascError
+from carlasc.storage.layout import identity_of
+
+if TYPE_CHECKING:
+    from carlasc.metrics.results import Interval
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")  # worst first
@@ -116,11 +123,13 @@ class ValidationResult:
         location: what was validated.
         findings: in the order of the sequences; errors first within a sequence.
         sequences: what was read of each sequence.
+        places: number of folders of sequences by split; empty if all were looked at.
     """
 
     location: str
     findings: tuple[Finding, ...]
     sequences: tuple[SequenceReport, ...]
+    places: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def verdict(self) -> Verdict:
@@ -143,6 +152,31 @@ class ValidationResult:
         """Return the number of findings of a severity."""
         return sum(finding.severity == severity for finding in self.findings)
 
+    def sequences_with(self, findings: Iterable[Finding]) -> Interval:
+        """Return the number of all sequences that have such findings, estimated with its interval
+        if only some were looked at.
+        """
+        from carlasc.metrics.results import estimate  # compiles loops, for scores
+
+        found = {finding.sequence for finding in findings}
+        values = np.array([report.path in found for report in self.sequences])
+        number = sum(self.places.values()) or len(values)
+        return estimate(values, np.full(len(values), 1 / number), number)
+
+    def by_split(self) -> dict[str, dict[str, int]]:
+        """Return the number of sequences and of frames of each split, and of its sequences with
+        findings of each severity and with checks of each state.
+        """
+        found = Counter((one.sequence, one.severity) for one in self.findings)
+        splits: dict[str, Counter[str]] = {}
+        for report in self.sequences:
+            sums = Counter(dict.fromkeys(("sequences", "frames", *SEVERITIES, *STATES), 0))
+            own = {severity for severity in SEVERITIES if found[report.path, severity]}
+            sums.update({"sequences": 1, "frames": report.frames})
+            sums.update(own | {*report.checks.values()})
+            splits.setdefault(identity_of(report.path)[0] or "none", Counter()).update(sums)
+        return {split: dict(sums) for split, sums in splits.items()}
+
     def grouped(self) -> dict[tuple[Severity, str], list[Finding]]:
         """Return the findings by severity and check, errors first."""
         groups: dict[tuple[Severity, str], list[Finding]] = {}
@@ -158,7 +192,9 @@ class ValidationResult:
             "location": self.location,
             "ok": self.ok,
             "verdict": self.verdict,
+            "splits": self.by_split(),
             "counts": {severity: self.count(severity) for severity in SEVERITIES},
             "findings": [asdict(finding) for finding in self.findings],
             "sequences": [asdict(report) for report in self.sequences],
+            "places": dict(self.places),
         }

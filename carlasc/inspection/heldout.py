@@ -139,7 +139,7 @@ def holdout(
 
     A left-out scan does not vote in any grid and is not used to track actors; it is used only to
     refine poses. If poses are refined, the same frames are also measured under the given poses.
-    Frames at the ends of a drive are not measured if their window has less than 80 % of the scans
+    Frames at the ends of a drive are not measured if their window has less than 80% of the scans
     of a whole window, unless all windows are like that. A frame that cannot be read is reported in
     the result. Nothing is written.
 

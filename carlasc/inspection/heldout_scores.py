@@ -55,7 +55,7 @@ class RayShares:
         missed: share of rays without an occupied voxel, both before and behind their return.
         error_median_m: median over the other rays of |first hit - measured range|, metres; the
             first hit is in the middle of the ray's path through its first occupied voxel.
-        error_90_m: 90 % of these errors are at most this large, metres.
+        error_90_m: 90% of these errors are at most this large, metres.
     """
 
     returns: int

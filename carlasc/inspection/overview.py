@@ -4,7 +4,6 @@ files only.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
@@ -19,13 +18,12 @@ from carlasc.core.arrays import IntArray
 from carlasc.core.notebook import data_frame
 from carlasc.errors import CarlascError, MissingDataError, check_types, without_credentials
 from carlasc.inspection.staleness import changed_inputs
-from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath
 from carlasc.storage.folder import FolderSequence
-from carlasc.storage.layout import Metadata, identity_of
+from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import Sequence, Source
-from carlasc.storage.shares import read_list, source_in
+from carlasc.storage.shares import sample_of, source_in
 
 if TYPE_CHECKING:
     import pandas
@@ -150,13 +148,11 @@ class Overview:
         """Return the sum of "frames" or "bytes" over all sequences, with its interval if only some
         were looked at.
         """
-        from carlasc.metrics.results import interval_of  # compiles loops, for scores
+        from carlasc.metrics.results import estimate  # compiles loops, for scores
 
-        values = np.array([getattr(one, name) or 0 for one in self.sequences], np.float64)
-        number, degrees = sum(self.places.values()) or len(values), len(values) - 1
-        missed = 1 - len(values) / number
-        variance = missed * number**2 * values.var(ddof=1) / len(values) if degrees else math.nan
-        return interval_of(number * values.mean(), (variance, degrees or 1))
+        values = np.array([getattr(one, name) or 0 for one in self.sequences])
+        number = sum(self.places.values()) or len(values)
+        return estimate(values, np.full(len(values), 1 / number), number)
 
     @property
     def splits(self) -> dict[str, int]:
@@ -194,14 +190,11 @@ def info(
             does not exist. None: the source is listed.
 
     Raises:
+        ArgumentError: `sample` is less than 1.
         MissingDataError: the source holds neither a sequence nor a capture.
     """
     check_types(info, locals())
-    places, chosen = list[str](), [""]
-    if sample is not None or sequences_from is not None:
-        places = read_list(Run(sequences_from=sequences_from), as_source(source).places)
-        step = -(-len(places) // max(sample or len(places), 1))
-        chosen = places[::step]
+    chosen, places = sample_of(as_source(source), sample, sequences_from)
     captures: dict[str, Capture] = {}
     if not isinstance(source, Source):
         with suppress(MissingDataError):
@@ -229,9 +222,7 @@ def info(
         tuple(_describe(sequence) for sequence in sequences.values()),
         recorded,
         location.stat().st_size if location.is_file() else None,
-        Counter(identity_of(f"{place}/cartesian")[0] or "none" for place in places)
-        if len(chosen) < len(places)
-        else {},
+        places,
     )
 
 

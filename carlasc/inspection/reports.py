@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import closing
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Any
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from carlasc.core.frames import FrameRange
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, MissingDataError, check_types
@@ -21,10 +25,16 @@ from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath, write_output
 from carlasc.storage.folder import FolderSequence
+from carlasc.storage.layout import identity_of
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.resuming import RECORD, read_record
+from carlasc.storage.shares import sample_of, source_in
 from carlasc.storage.views import ChosenSequences
 
+if TYPE_CHECKING:
+    from carlasc.metrics.results import Interval
+
+_SUMMED = ("voxels", "known", "occupied")
 _MOST_LEFT_OUT = 20  # scans that are left out of a long sequence for its held-out scores
 
 
@@ -37,18 +47,42 @@ class ReportResult:
         reports: the report of each grid, by the path of its sequence and the name of the grid:
             "Val/Town/cartesian/evaluation".
         failures: frames that could not be read, for reports that were made.
+        places: number of folders of sequences by split; empty if all were looked at.
     """
 
     location: str
     reports: Mapping[str, Report]
     failures: tuple[FrameFailure, ...] = ()
+    places: Mapping[str, int] = field(default_factory=dict)
+
+    def known(self) -> Interval:
+        """Return the share of known voxels in all grids, estimated with its interval if only some
+        were looked at.
+        """
+        from carlasc.metrics.results import estimate  # compiles loops, for scores
+
+        seen = [report.coverage for report in self.reports.values()]
+        known, voxels = np.array([(one.known, one.voxels) for one in seen]).T
+        return estimate(known, voxels, sum(self.places.values()) or len(seen))
+
+    def by_split(self) -> dict[str, dict[str, int]]:
+        """Return sums of the grids of each name in each split, such as "Train/evaluation"."""
+        kinds: dict[str, Counter[str]] = {}
+        for name, report in self.reports.items():
+            path, _, grid = name.rpartition("/")
+            sums = kinds.setdefault(f"{identity_of(path)[0] or 'none'}/{grid}", Counter())
+            voxels = {key: getattr(report.coverage, key) for key in _SUMMED}
+            sums.update({"grids": 1, "frames": len(report.frames), **voxels})
+        return {kind: dict(sums) for kind, sums in kinds.items()}
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain values for JSON."""
         return {
             "location": self.location,
+            "splits": self.by_split(),
             "reports": {name: report.to_dict() for name, report in self.reports.items()},
             "failures": [asdict(failure) for failure in self.failures],
+            "places": dict(self.places),
         }
 
 
@@ -59,6 +93,7 @@ def report(
     remake: bool = False,
     holdout: bool = False,
     save: bool = False,
+    sample: int | None = None,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> ReportResult:
     """Return the report of each grid of a data set: the report that its run wrote, or one that is
@@ -74,19 +109,21 @@ def report(
         holdout: also measure held-out rays, as `carlasc validate --holdout` does, of Cartesian
             grids that were made from scans.
         save: write the reports into the folders of the grids (only of grids that carlasc made).
+        sample: number of sequences to look at, evenly spaced, if there are more. None: all.
         run: how the work is spread, with a callback for the progress of reports that are made.
 
     Raises:
         MissingDataError: there is no data set, or no grid of this name.
         FormatError: a report is damaged; `remake` makes it again.
-        ArgumentError: `save` with a source that is not a folder.
+        ArgumentError: `sample` is less than 1, or `save` with a source that is not a folder.
         ConflictError: `save` with a grid that carlasc did not make.
     """
     check_types(report, locals())
     opened = as_source(source)
+    chosen, places = sample_of(opened, sample)
     grids = [
         (path, sequence, name)
-        for path, sequence in opened.sequences().items()
+        for path, sequence in source_in(opened, chosen).sequences().items()
         for name in sequence.grids
         if grid in (None, name) and sequence.predicted_by(name) is None
     ]
@@ -116,7 +153,7 @@ def report(
             if save and isinstance(sequence, FolderSequence):
                 write_output(sequence.folder / layout.report_file(name), one.to_json())
             reports[f"{path}/{name}" if path else name] = one
-    return ReportResult(opened.location, reports, tuple(failures))
+    return ReportResult(opened.location, reports, tuple(failures), places)
 
 
 def report_beside(sequence: Sequence, grid: str) -> Report | None:
@@ -148,7 +185,11 @@ class _ReportMaker:
     def __init__(self, sequence: Sequence, grid: str) -> None:
         self.sequence, self.grid = sequence, grid
         self.frames: list[int] = sequence.frames(f"{grid}/labels").tolist()
-        self.inputs = inputs_of(sequence, grid)
+
+    @cached_property
+    def inputs(self) -> ScanSequence | None:
+        """The scans that the grid was made from: see `inputs_of`."""
+        return inputs_of(self.sequence, self.grid)
 
     @property
     def steps(self) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
@@ -23,10 +23,13 @@ from carlasc.storage.class_files import read_classes, read_remap
 from carlasc.storage.files import AnyPath
 from carlasc.storage.layout import EVALUATION
 from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.shares import sample_of, source_in
 from carlasc.storage.voxel_files import VoxelSequence
 
 if TYPE_CHECKING:
     import pandas
+
+    from carlasc.metrics.results import Interval
 
 Kind = Literal["points", "voxels"]
 KINDS: tuple[Kind, ...] = ("points", "voxels")
@@ -93,6 +96,7 @@ class Statistics:
         splits: the split of each sequence, by its path; "none" if the path names no split.
         failures: (file, message) of the frames that could not be read.
         uses: the class tables of the labels, and what named them.
+        places: number of folders of sequences by split; empty if all were counted.
     """
 
     location: str
@@ -102,6 +106,7 @@ class Statistics:
     splits: dict[str, str]
     failures: tuple[tuple[str, str], ...] = ()
     uses: tuple[TableUse, ...] = ()
+    places: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
     @property
     def total(self) -> Histogram:
@@ -133,6 +138,20 @@ class Statistics:
     def named(self, counts: IntArray) -> dict[str, int]:
         """Return (C,) counts of the classes by their names."""
         return {name: int(counts[index]) for index, name in self.classes.names.items()}
+
+    def intervals(self, kind: Kind, *, remapped: bool = False) -> dict[str, Interval]:
+        """Return the share of each class in all sequences, estimated from those that were counted,
+        with its interval.
+        """
+        from carlasc.metrics.results import estimate  # compiles loops, for scores
+
+        names = self.summed if remapped else self.named
+        rows = [names(histogram.of(kind)) for histogram in self.sequences.values()]
+        sizes, number = np.array([sum(row.values()) for row in rows]), sum(self.places.values())
+        return {
+            name: estimate(np.array([row[name] for row in rows]), sizes, number or len(rows))
+            for name in rows[0]
+        }
 
     def weights(self) -> dict[str, float]:
         """Return the loss weight of each class, remapped if there is a remap, from the known voxels
@@ -186,6 +205,13 @@ class Statistics:
             "splits": {split: plain(histogram) for split, histogram in self.by_split().items()},
             "sequences": {path: plain(histogram) for path, histogram in self.sequences.items()},
             "class_weights": self.weights(),
+            "places": dict(self.places),
+            "intervals": {
+                kind: {name: [one.low, one.high] for name, one in self.intervals(kind).items()}
+                for kind in KINDS
+            }
+            if self.places
+            else {},
             "failures": [list(failure) for failure in self.failures],
         }
 
@@ -196,6 +222,7 @@ def stats(
     grid: str = EVALUATION,
     remap: str | Remap | None = "auto",
     every: int = 1,
+    sample: int | None = None,
     source_classes: ClassTable | AnyPath | None = None,
     allow_unknown: bool = False,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
@@ -209,6 +236,7 @@ def stats(
             of classes with a map, None for no second table, or "auto", which takes the paper's 11
             classes or SemanticKITTI's 19.
         every: count only every N-th frame.
+        sample: number of sequences to count, evenly spaced, if there are more. None: all.
         source_classes: class table of the labels, if the metadata do not name it: a table, its
             name, or a JSON or YAML file. None: that of the metadata.
         allow_unknown: count points and voxels whose id is no class apart, instead of listing their
@@ -219,7 +247,7 @@ def stats(
         The histograms. Frames that could not be read are listed in `failures`.
 
     Raises:
-        ArgumentError: `every` is less than 1, or the remap is unknown.
+        ArgumentError: `every` or `sample` is less than 1, or the remap is unknown.
         FormatError: the sequences have different class tables, or the remap is of another table.
         MissingDataError: there is no data set, or it has no labels.
     """
@@ -227,7 +255,8 @@ def stats(
     if every < 1:
         raise ArgumentError("every", expected="1 or more", found=str(every))
     opened = as_source(source)
-    sequences = opened.sequences()
+    chosen, places = sample_of(opened, sample)
+    sequences = source_in(opened, chosen).sequences()
     if source_classes is not None:
         given = read_classes(source_classes, "source_classes")[0]
         sequences = {path: one.with_classes(given) for path, one in sequences.items()}
@@ -236,7 +265,7 @@ def stats(
         expected, advice = f"labels of points or the grid {grid}", "name another grid with `grid`"
         raise MissingDataError(opened.location, expected=expected, found="neither", advice=advice)
     classes = _common_table(tasks, opened.location)
-    chosen = _choose_remap(remap, classes)
+    target = _choose_remap(remap, classes)
     step = StepCounter(run.progress, sum(len(frames) for _, _, frames in tasks))
     histograms = {path: Histogram.empty(classes) for path in sequences}
     failures: list[tuple[str, str]] = []
@@ -253,7 +282,14 @@ def stats(
     splits = {path: sequence.split or "none" for path, sequence in sequences.items()}
     uses = {sequence.table_use(field.rpartition("/")[0]) for sequence, field, _ in tasks}
     return Statistics(
-        opened.location, classes, chosen, histograms, splits, tuple(failures), tuple(sorted(uses))
+        opened.location,
+        classes,
+        target,
+        histograms,
+        splits,
+        tuple(failures),
+        tuple(sorted(uses)),
+        places,
     )
 
 

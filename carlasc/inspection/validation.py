@@ -56,6 +56,7 @@ from carlasc.storage.files import AnyPath
 from carlasc.storage.folder import FolderSequence
 from carlasc.storage.inputs import digest_of
 from carlasc.storage.protocol import Sequence, Source
+from carlasc.storage.shares import sample_of, source_in
 
 _ADVICE = (
     "make the report again with `carlasc report --remake --save`, or the grid with "
@@ -142,6 +143,7 @@ def validate(
     source: AnyPath | Source,
     *,
     every: int | None = None,
+    sequences: int | None = None,
     accept: Collection[str] = (),
     sample: int = 0,
     record: bool = False,
@@ -158,6 +160,7 @@ def validate(
         source: a path or URL that `carlasc.open` knows, or a Source.
         every: read the contents of every N-th frame; 1 reads all. None: about forty frames per
             sequence.
+        sequences: number of sequences to look at, evenly spaced, if there are more. None: all.
         accept: checks whose warnings are true of the place, as in a tunnel: carlasc.json of the
             sequence then says so.
         sample: number of frames of each grid that are made again from the scans beside it and
@@ -170,15 +173,18 @@ def validate(
         The findings, and the verdict.
 
     Raises:
-        ArgumentError: `every` is less than 1, no check has the name of an accepted one, or the data
-            are not in a folder, so that they cannot say what was accepted or recorded.
+        ArgumentError: `every` or `sequences` is less than 1, no check has the name of an accepted
+            one, or the data are not in a folder, so that they cannot say what was accepted or
+            recorded.
         MissingDataError: there is no data set.
     """
     check_types(validate, locals())
     if every is not None and every < 1:
         raise ArgumentError("every", expected="1 or more", found=str(every))
     opened = as_source(source)
-    plans = [_plan(sequence, every, accept) for sequence in opened.sequences().values()]
+    chosen, places = sample_of(opened, sequences, name="sequences")
+    some = source_in(opened, chosen).sequences().values()
+    plans = [_plan(sequence, every, accept) for sequence in some]
     step = StepCounter(run.progress, sum(plan.steps for plan in plans))
     findings: list[Finding] = []
     reports = []
@@ -197,7 +203,7 @@ def validate(
     if unknown := sorted({*accept} - {*CHECKS} - {finding.check for finding in findings}):
         raise ArgumentError("accept", expected=f"checks, such as {OVERLAP}", found=unknown[0])
     record_accepted(opened, findings, accept)
-    return ValidationResult(opened.location, tuple(findings), tuple(reports))
+    return ValidationResult(opened.location, tuple(findings), tuple(reports), places)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from carlasc.core.arrays import IntArray
+from carlasc.core.arrays import AnyArray, IntArray
 from carlasc.core.classes import ClassTable, TableUse
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics.actor_scores import ActorScore
@@ -371,7 +371,7 @@ def _percent(*values: float) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class Interval:
-    """A confidence interval of 95 %.
+    """A confidence interval of 95%.
 
     Attributes:
         value: the score over all sequences.
@@ -382,6 +382,10 @@ class Interval:
     value: float
     low: float
     high: float
+
+    def text(self, write: Callable[[float], str]) -> str:
+        """Return "value (low to high)", each written by a function."""
+        return f"{write(self.value)} ({write(self.low)} to {write(self.high)})"
 
 
 @dataclass(frozen=True)
@@ -428,6 +432,22 @@ def interval_of(value: float, *parts: tuple[float, float]) -> Interval:
     tangent = math.tan(np.interp(_LEVEL, below / below[-1], angle))
     bound = math.sqrt(min(freedom, _NEARLY_NORMAL) * variance) * tangent
     return Interval(value, value - bound, value + bound)
+
+
+def estimate(values: AnyArray, sizes: AnyArray, number: int) -> Interval:
+    """Return the ratio of two sums over sequences, of which a sample is known.
+
+    Args:
+        values: (N,) what is summed, of each sequence of the sample.
+        sizes: (N,) what the sum is divided by.
+        number: number of all sequences.
+    """
+    ratio, degrees = values.sum() / (sizes.sum() or math.nan), len(values) - 1
+    if not degrees:
+        return Interval(ratio, math.nan, math.nan)
+    error = (values - ratio * sizes) / sizes.mean()
+    missed = 1 - len(values) / number
+    return interval_of(ratio, (missed * error.var(ddof=1) / len(values), degrees))
 
 
 def jackknife(figure: Callable[[IntArray], float], counts: IntArray) -> tuple[float, float]:

@@ -305,7 +305,7 @@ def usual_shell(lower: FloatArray, upper: FloatArray, extent: Extent) -> Float32
     """Return points on the surface that a vehicle of this size usually has; none for vehicles with
     two wheels.
 
-    A car has a body of 60 % of its height, and a narrower cabin above its rear three quarters.
+    A car has a body of 60% of its height, and a narrower cabin above its rear three quarters.
     Lorries and buses are boxes.
 
     Args:

@@ -34,7 +34,7 @@ from carlasc.core.arrays import (
     LabelArray,
     Uint32Array,
 )
-from carlasc.core.cells import Pose, as_pose, distinct, fast_azimuth, numbered, transform
+from carlasc.core.cells import Pose, as_pose, distinct, fast_azimuth, joined, numbered, transform
 from carlasc.core.compiling import cached, inlined
 from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
 from carlasc.core.scans import finite, runs_of_origins
@@ -348,7 +348,7 @@ def _clusters(
     # One point that moved makes a cell a seed: such points are rare on static things. Points that
     # were free on one side only are common behind edges, so a cell needs a large share of them.
     seeds = (np.bincount(flat, moved[inside], minlength=len(keys)) > 0) | (share >= _FLAGGED_SHARE)
-    component = _join(keys, seeds, int(width))[flat]
+    component = joined(keys, seeds, int(width))[flat]
     groups: list[IntArray] = []
     kept = np.flatnonzero(component >= 0)
     order = kept[np.argsort(component[kept], kind="stable")]
@@ -390,48 +390,6 @@ def _count_around(world: FloatArray, groups: list[IntArray], static: BoolArray) 
         # static points of the group itself count too
         counts.append(int(((near >= lower) & (near <= upper)).sum()))
     return tuple(counts)
-
-
-@cached
-def _join(keys: IntArray, seeds: BoolArray, width: int) -> IntArray:
-    """Return the component of each cell: seeds that touch are one component, and other cells belong
-    to a seed beside them; -1 without one.
-
-    Args:
-        keys: (C,) row times width plus column of each cell, increasing.
-        seeds: (C,) which cells hold moved points.
-        width: columns per row.
-    """
-    # Union-find: every cell points towards the lowest cell of its component, so components have the
-    # same numbers whatever the order of joins. Half of the neighbours is enough: joins go both
-    # ways.
-    parent = np.arange(len(keys))
-    for i in range(len(keys)):
-        if not seeds[i]:
-            continue
-        for step in (1, width - 1, width, width + 1):
-            j = np.searchsorted(keys, keys[i] + step)
-            if j < len(keys) and keys[j] == keys[i] + step and seeds[j]:
-                a, b = i, j
-                while parent[a] != a:
-                    a = parent[a]
-                while parent[b] != b:
-                    b = parent[b]
-                parent[max(a, b)] = min(a, b)
-    component = np.full(len(keys), -1, np.int64)
-    for i in range(len(keys)):
-        if seeds[i]:
-            a = i
-            while parent[a] != a:
-                a = parent[a]
-            component[i] = a
-    for i in range(len(keys)):
-        if not seeds[i]:
-            for step in (-width - 1, -width, -width + 1, -1, 1, width - 1, width, width + 1):
-                j = np.searchsorted(keys, keys[i] + step)
-                if j < len(keys) and keys[j] == keys[i] + step and seeds[j]:
-                    component[i] = component[j]
-    return component
 
 
 _COLUMNS = 1024

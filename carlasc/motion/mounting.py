@@ -51,7 +51,7 @@ class Mounting:
         values: (7,) x, y, z of the sensor in metres, its rotation vector in radians, and the delay
             of the poses in seconds: a scan has the pose that the file gives for a later time. Exact
             poses of the sensor have zeros.
-        errors: (7,) half the widths of intervals that hold the true value in 95 % of the cases
+        errors: (7,) half the widths of intervals that hold the true value in 95% of the cases
             (docs/studies/poses.md), infinite where a value is not determined, or where drift,
             jitter or distortion of the poses explain as much.
     """

@@ -294,7 +294,7 @@ def _shift_of_ends(before: FloatArray, now: FloatArray, velocity: FloatArray) ->
 
 
 def ends(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the 2 % and 98 % quantiles of each column of (N, K) values.
+    """Return the 2% and 98% quantiles of each column of (N, K) values.
 
     `np.quantile` returns the same and takes much longer.
     """

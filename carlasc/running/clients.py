@@ -23,7 +23,7 @@ from typing import Any, Self, TypeVar
 from carlasc.core.first_use import is_first_use
 from carlasc.errors import CarlascError, carlasc_version, import_extra
 from carlasc.running.pools import ONE_THREAD, LostTaskError
-from carlasc.running.spreading import DaskClient, LazyClient
+from carlasc.running.spreading import DaskClient
 
 
 @dataclass(frozen=True)
@@ -135,22 +135,24 @@ def _prepare(session: Session) -> None:
 
 
 def _name() -> str:
-    from distributed import get_worker
+    with suppress(ImportError, ValueError):  # a worker of Ray
+        from distributed import get_worker
 
-    return str(get_worker().address)
+        return str(get_worker().address)
+    return platform.node()
 
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_AHEAD = 4  # submitted tasks per thread of the workers
-_LEAST = 32  # minimum number of submitted tasks, so that one call can submit several
+AHEAD = 4  # submitted tasks per thread of the workers
+LEAST = 32  # minimum number of submitted tasks, so that one call can submit several
 _TOGETHER = 16  # maximum number of results that are fetched together
 _COUNT_S = 1.0  # workers are counted again after this time
 
 
 def run_on_cluster(
-    client: DaskClient | LazyClient,
+    client: DaskClient,
     function: Callable[[Item], Result],
     items: Iterable[Item],
     lost: Callable[[Item, str], Result] | None,
@@ -166,7 +168,6 @@ def run_on_cluster(
         CarlascError: the connection to the scheduler is lost, a worker has other versions, or an
             item is given up and `lost` is None.
     """
-    client = client.client if isinstance(client, LazyClient) else client
     distributed = import_extra("distributed", "cluster")
     with one_line_if_lost(client):
         tasks = _Tasks(client, function, distributed)
@@ -204,7 +205,7 @@ class _Tasks:
         """Maximum number of submitted tasks. It grows when workers are added."""
         if time.monotonic() - self._counted > _COUNT_S:
             self._threads, self._counted = sum(self._client.nthreads().values()), time.monotonic()
-        return max(_AHEAD * self._threads, _LEAST)
+        return max(AHEAD * self._threads, LEAST)
 
     def submit(self, items: list[Any]) -> None:
         """Submit tasks for some items."""

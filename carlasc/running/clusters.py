@@ -17,12 +17,13 @@ from typing import Any
 from carlasc.errors import ArgumentError, CarlascError, import_extra
 from carlasc.running.clients import Versions, one_line_if_lost
 from carlasc.running.pools import DEATHS, ONE_THREAD, inherited_by_workers
+from carlasc.running.ray_tasks import connected
 from carlasc.running.spreading import DaskClient, LazyClient, Run
 
 _CONNECT_S = "10s"  # the Dask setting carlasc.connect-timeout replaces it; fact: cluster-connect
 _WORKERS_S = "10m"  # the Dask setting carlasc.workers-timeout replaces it; fact: cluster-workers
 _REFILL_S = 2.0
-_FORMS = "local, local:N, tcp://HOST:PORT, slurm, or the dotted path of a class"
+_FORMS = "local, local:N, tcp://HOST:PORT, ray://HOST:PORT, slurm, or the dotted path of a class"
 _SETTINGS = {
     "distributed.scheduler.allowed-failures": DEATHS - 1,
     # a worker holds only its current task, so that no other task is lost if it dies
@@ -35,7 +36,7 @@ _SETTINGS = {
 
 @contextmanager
 def open_cluster(where: str, *, workers: int | None = None) -> Iterator[LazyClient]:
-    """Yield a Dask cluster for `run_all` and every argument `executor`.
+    """Yield a Dask or Ray cluster for `run_all` and every argument `executor`.
 
     The cluster starts with the first task, and is stopped at the end of the block, immediately if
     the block fails. All workers need the same version of carlasc, and must read and write the same
@@ -43,21 +44,25 @@ def open_cluster(where: str, *, workers: int | None = None) -> Iterator[LazyClie
 
     Args:
         where: "local": new processes on this machine; "local:N": N processes; "tcp://HOST:PORT"
-            ("tls://", "ws://"): a running scheduler; "slurm": Slurm jobs, as in the configuration
-            file of Dask (`jobqueue.slurm`); "package.module.Class": a class that starts a cluster
-            when it is called without arguments.
+            ("tls://", "ws://"): a running scheduler; "ray://HOST:PORT": a running Ray cluster;
+            "slurm": Slurm jobs, as in the configuration file of Dask (`jobqueue.slurm`);
+            "package.module.Class": a class that starts a cluster when it is called without
+            arguments.
         workers: number of processes of "local", None for one per core; number of jobs or workers of
             the other clusters that are started.
 
     Raises:
         ArgumentError: `where` has none of these forms, or the number of workers is missing.
-        DependencyError: Dask is not installed.
+        DependencyError: Dask, or Ray for "ray://", is not installed.
         CarlascError: the scheduler does not answer, no worker starts in time, or a worker has other
             versions.
     """
-    distributed = import_extra("distributed", "cluster")
-    start = _starter(where, workers)
     with ExitStack() as open_things:
+        if where.startswith("ray://"):
+            yield LazyClient(partial(open_things.enter_context, connected(where)))
+            return
+        distributed = import_extra("distributed", "cluster")
+        start = _starter(where, workers)
 
         def connect() -> DaskClient:
             import dask

@@ -15,7 +15,7 @@ from typing import TypeVar
 from carlasc.core.first_use import is_first_use
 from carlasc.errors import CarlascError
 from carlasc.running.pools import LostTaskError, OwnProcesses
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import LazyClient, Run
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -59,13 +59,17 @@ def run_all(
     items, is_one = chain(first, waiting), len(first) < 2
     if not first:
         return
+    if isinstance(executor, LazyClient):
+        executor = executor.client
     if executor is None and workers > 1 and not is_one:
         with _own_processes(workers) as pool:
             yield from _submit_all(pool, function, items, 2 * workers, lost)
     elif executor is None or (isinstance(executor, OwnProcesses) and is_one):
         yield from map(function, items)
     elif isinstance(executor, Executor):
-        yield from _submit_all(executor, function, items, 2 * workers, lost)
+        yield from _submit_all(
+            executor, function, items, getattr(executor, "window", 2 * workers), lost
+        )
     else:
         from carlasc.running.clients import run_on_cluster  # imports Dask
 

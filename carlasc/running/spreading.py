@@ -42,12 +42,12 @@ class LazyClient:
         connect: returns the client.
     """
 
-    def __init__(self, connect: Callable[[], DaskClient]) -> None:
+    def __init__(self, connect: Callable[[], DaskClient | Executor]) -> None:
         self._connect = connect
 
     @cached_property
-    def client(self) -> DaskClient:
-        """The Dask client, connected on first access."""
+    def client(self) -> DaskClient | Executor:
+        """The client of Dask, or the executor of Ray, connected on first access."""
         return self._connect()
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -206,6 +207,21 @@ def image_bytes(
     )
 
 
+@contextmanager
+def opened_image(data: bytes, where: str) -> Iterator[Any]:
+    """Open the bytes of a JPEG or PNG file as an image of Pillow.
+
+    Raises:
+        DependencyError: Pillow is not installed.
+        FormatError: the image is damaged or far too large, or the block raised such an error.
+    """
+    with reading(where, "a whole JPEG or PNG"):
+        image = import_extra("PIL.Image", "render")
+        # Pillow gives other formats, such as PostScript, to other programs
+        with image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as picture:
+            yield picture
+
+
 def decode_image(data: bytes, where: str, camera: CameraModel, *, color: bool) -> AnyArray:
     """Return the pixels of a JPEG or PNG file of a camera, as `read_image` does.
 
@@ -215,22 +231,14 @@ def decode_image(data: bytes, where: str, camera: CameraModel, *, color: bool) -
         FormatError: the image is cut short or damaged, or has another size than the camera's
             calibration.
     """
-    image = import_extra("PIL.Image", "render")
-    try:
-        with image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as picture:
-            if picture.size != (camera.width, camera.height):
-                size = f"{camera.width} x {camera.height}"
-                expected = f"{size} pixels, as camera {camera.name} is calibrated"
-                raise FormatError(
-                    where, expected=expected, found=f"{picture.size[0]} x {picture.size[1]}"
-                )
-            pixels = np.asarray(picture.convert("RGB") if color else picture)
-    except FormatError:
-        raise
-    except (OSError, ValueError, SyntaxError, image.DecompressionBombError) as error:
-        raise FormatError(
-            where, expected="a whole JPEG or PNG", found="something else", advice=str(error)
-        ) from error
+    with opened_image(data, where) as picture:
+        if picture.size != (camera.width, camera.height):
+            size = f"{camera.width} x {camera.height}"
+            expected = f"{size} pixels, as camera {camera.name} is calibrated"
+            raise FormatError(
+                where, expected=expected, found=f"{picture.size[0]} x {picture.size[1]}"
+            )
+        pixels = np.asarray(picture.convert("RGB") if color else picture)
     if not color and (pixels.ndim != 2 or pixels.dtype.kind not in "iu"):
         raise FormatError(
             where, expected="a PNG with one integer per pixel", found=f"shape {pixels.shape}"

@@ -18,10 +18,11 @@ import numpy as np
 from carlasc.core.arrays import AnyArray
 from carlasc.errors import ConflictError, check_types
 from carlasc.running.processes import run_all
-from carlasc.running.spreading import Run, StepCounter
+from carlasc.running.spreading import Part, Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.files import AnyPath, unfinished
 from carlasc.storage.folder import FolderSink
+from carlasc.storage.inputs import combined, sequence_state
 from carlasc.storage.opening import as_source
 from carlasc.storage.packed.output import put_in_place
 from carlasc.storage.protocol import Sequence, SequenceWriter, Sink, Source
@@ -111,13 +112,29 @@ def _copy(block: FrameBlock) -> int:
     return block.files
 
 
-def copy_documents(sequence: Sequence, writer: SequenceWriter) -> None:
+def record_of(part: Part) -> str:
+    """Return the text file by which a part knows the input that it copies: each part may read a
+    copy of the input on a machine of its own.
+    """
+    return layout.record_file(f"copied-{part.number}-of-{part.count}")
+
+
+def copy_documents(
+    sequence: Sequence, writer: SequenceWriter, part: Part, made_from: str = ""
+) -> None:
     """Copy the text files of a sequence.
 
     Equal files, from an interrupted run or another part of this run, are kept.
 
+    Args:
+        sequence: the sequence.
+        writer: writes the copy.
+        part: the part of the run.
+        made_from: digest of what else the copy is made from.
+
     Raises:
-        ConflictError: an existing text file is different.
+        ConflictError: an existing text file is different, or the sequence changed since an earlier
+            run of this part.
     """
     for name in sequence.documents():
         data = sequence.read_document(name)
@@ -128,6 +145,15 @@ def copy_documents(sequence: Sequence, writer: SequenceWriter) -> None:
                 found="a different file",
                 advice="choose another name, or remove the existing output",
             )
+    state = combined(made_from, sequence_state(sequence, sequence.fields(), ())).encode()
+    record = record_of(part)
+    if not writer.create_document(record, state) and writer.read_document(record) != state:
+        raise ConflictError(
+            writer.location,
+            expected=f"{sequence.location} as it was in the earlier run",
+            found="files that changed",
+            advice="remove the output, or choose another name",
+        )
 
 
 def typical_rows(sequence: Sequence) -> dict[str, int]:
@@ -237,25 +263,38 @@ def unpack(
             advice="choose another name, or give `overwrite=True`",
         )
     share, sink = Share(source, run), FolderSink(result.out if final is None else unfinished(final))
-    write_files(share.sequences(), sink, result, share.run, again=overwrite)
+    write_files(share.sequences(), sink, result, share.run, run.part, again=overwrite)
     if final is not None:
+        for path in result.sequences:
+            sink.sequence(path).remove_document(record_of(run.part))
         put_in_place(unfinished(final), final, overwrite=False)
     result.elapsed_s = time.perf_counter() - began
     return result
 
 
 def write_files(
-    sequences: Mapping[str, Sequence], sink: Sink, result: UnpackResult, run: Run, *, again: bool
+    sequences: Mapping[str, Sequence],
+    sink: Sink,
+    result: UnpackResult,
+    run: Run,
+    part: Part,
+    made_from: str = "",
+    *,
+    again: bool,
 ) -> None:
-    """Write the sequences of a part of a run, and add to the result what was written."""
+    """Write the sequences of a part of a run, and add to the result what was written.
+
+    `made_from` is a digest of what they are made from, besides their files.
+    """
     blocks = list[FrameBlock]()
     for path, sequence in sequences.items():
         result.sequences.append(path)
         writer = sink.sequence(path)
         if again:
+            writer.remove_document(record_of(part))
             for name in sequence.documents():
                 writer.write_document(name, sequence.read_document(name))
         else:
-            copy_documents(sequence, writer)
+            copy_documents(sequence, writer, part, made_from)
         blocks += blocks_of(sequence, writer, _BLOCK)
     result.files, result.kept = copy_blocks(blocks, run, again=again)

@@ -30,6 +30,7 @@ from carlasc.storage.files import (
     AnyPath,
     has_content,
     make_folder,
+    remove_stale_of,
     replaced,
     sync_all,
     to_json,
@@ -37,7 +38,7 @@ from carlasc.storage.files import (
     write_atomic,
 )
 from carlasc.storage.folder import FolderSequence, FolderSink, FolderSource
-from carlasc.storage.inputs import sequence_states
+from carlasc.storage.inputs import combined, sequence_states
 from carlasc.storage.layout import Metadata
 from carlasc.storage.packed.output import remove
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
@@ -165,6 +166,8 @@ class DerivedCopy:
         source: the source of the copy.
         out: the folder to write: a path, or a URL of an object store.
         overwrite: whether it replaces an existing copy.
+        part: the part of the run.
+        made_from: digest of input and options.
         mark: the file that records input and options of the unfinished copy; None in object stores,
             and in runs of several parts.
     """
@@ -202,11 +205,12 @@ class DerivedCopy:
         run.part.refuse(overwrite)
         refuse_overlap(out, source)
         self.source, self.out, self.overwrite = source, out, overwrite
-        self.is_part = run.part.count > 1
+        self.part = run.part
         self.mark: Path | None = None
-        if not (is_url(out) or self.is_part):
-            inputs = sequence_states(source)
-            settings = {"source": source.location, "kind": kind, "inputs": inputs, **made_from}
+        inputs = sequence_states(source)
+        settings = {"source": source.location, "kind": kind, "inputs": inputs, **made_from}
+        self.made_from = combined(to_json(settings))
+        if not (is_url(out) or run.part.count > 1):
             self.mark = _mark_of(unfinished(Path(out)))
             if not overwrite and Path(out).exists():
                 if self._was_finished(to_json(settings)):
@@ -239,14 +243,13 @@ class DerivedCopy:
         if not is_url(self.out):
             folder = Path(self.out) if self.mark is None else unfinished(Path(self.out))
             linked = sum(_link_files(one, folder / path) for path, one in sequences.items())
-        chosen = ChosenSequences(self.source.location, sequences)
-        aside = self.overwrite and self.mark is None
         with _naming_replaced(Path(self.out)):
-            if self.is_part:
+            if self.mark is None:
                 copied = UnpackResult(str(self.out) if is_url(self.out) else Path(self.out))
-                write_files(sequences, FolderSink(self.out), copied, run, again=False)
+                sink, made_from, again = FolderSink(self.out), self.made_from, self.overwrite
+                write_files(sequences, sink, copied, run, self.part, made_from, again=again)
             else:
-                copied = unpack(chosen, self.out, overwrite=aside, run=run)
+                copied = unpack(ChosenSequences(self.source.location, sequences), self.out, run=run)
         self._finish(sequences)
         return CopyResult(
             **vars(copied)
@@ -329,6 +332,7 @@ def _begin(mark: Path, folder: Path, data: bytes, *, overwrite: bool) -> None:
         ConflictError: the folder holds the files of an interrupted run with another input or other
             options.
     """
+    remove_stale_of(mark)
     before = mark.read_bytes() if mark.is_file() else None
     if folder.exists() and before != data:
         if before is None or not overwrite:

@@ -24,7 +24,7 @@ TABLES = {
     "boxes": (BOXES_DTYPE,),
 }
 """The types of a row of a table, by the kind of the field."""
-# Level 6, the default of zlib, takes 6 times as long and saves only 3 %: the voxels of votes are
+# Level 6, the default of zlib, takes 6 times as long and saves only 3%: the voxels of votes are
 # sorted, so repeats are always four bytes apart.
 _LEVELS = {"votes": (1, 4, 4), "velocities": (4, 4)}  # of the columns
 _READ_FIRST = ("label", "voxel", "velocity", "votes")  # the order in which columns are read

@@ -198,13 +198,18 @@ def sequence_states(source: Source, *more: str) -> dict[str, str]:
     states = {}
     for path, sequence in source.sequences().items():
         own = [name for name in sequence.fields() if "/" not in name]
-        files = SequenceFiles(sequence, *own, *more)
-        frames = {frame for name in files.fields for frame in sequence.frames(name).tolist()}
         texts = [name for name in sequence.documents() if "/" not in name]
-        states[path] = combined(
-            _states(files, sorted(frames)), [(name, sequence.read_document(name)) for name in texts]
-        )
+        states[path] = sequence_state(sequence, [*own, *more], texts)
     return states
+
+
+def sequence_state(sequence: Sequence, fields: Iterable[str], texts: Iterable[str]) -> str:
+    """Return the state of some fields and text files of a sequence."""
+    files = SequenceFiles(sequence, *fields)
+    frames = {frame for name in files.fields for frame in sequence.frames(name).tolist()}
+    return combined(
+        _states(files, sorted(frames)), [(name, sequence.read_document(name)) for name in texts]
+    )
 
 
 def _read_rows(writer: SequenceWriter, document: str) -> dict[int, tuple[str, str]]:
@@ -253,8 +258,14 @@ class MadeFrom:
     def write(self, writer: SequenceWriter, output: str) -> None:
         """Write the record, unless it is equal to the existing one."""
         if self != self.read(writer, output):
-            data = to_json({"format": _FORMAT, **asdict(self)})
-            writer.write_document(layout.record_file(output), data)
+            writer.write_document(layout.record_file(output), self._to_json())
+
+    def create(self, writer: SequenceWriter, output: str) -> None:
+        """Write the record, unless there is one."""
+        writer.create_document(layout.record_file(output), self._to_json())
+
+    def _to_json(self) -> bytes:
+        return to_json({"format": _FORMAT, **asdict(self)})
 
 
 def folder_states(places: Mapping[str, Path]) -> dict[str, str]:

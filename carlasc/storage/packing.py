@@ -23,10 +23,12 @@ from carlasc.storage.copying import (
     blocks_of,
     copy_blocks,
     copy_documents,
+    record_of,
     refuse_overlap,
     typical_rows,
 )
 from carlasc.storage.files import AnyPath, storage_error
+from carlasc.storage.inputs import combined, sequence_state
 from carlasc.storage.opening import as_source, open, open_sink
 from carlasc.storage.packed.stores import PackedSink, PackedSource, PackOptions, check_names
 from carlasc.storage.protocol import Sequence, Source
@@ -138,6 +140,11 @@ def pack(
         if isinstance(sequence, PublishedSequence):
             result.left_out += [f"{path or '.'}: {name}" for name in sequence.unknown_files()]
     try:
+        if PurePath(out).suffix == ".parquet":
+            states = [
+                sequence_state(one, one.fields(), one.documents()) for one in sequences.values()
+            ]
+            options = replace(options, made_from=combined(states))
         sink = open_sink(out, options, overwrite)
         if isinstance(sink, PackedSink):
             result.published_bytes = _append(sequences, sink, run.progress, run.workers or _AHEAD)
@@ -169,7 +176,7 @@ def _pack_blocks(share: Share, sequences: Mapping[str, Sequence], sink: ZarrSink
     for path, sequence in sequences.items():
         writers.append(writer := sink.sequence(path))
         writer.identity = (sequence.split, sequence.name, sequence.coordinates)
-        copy_documents(sequence, writer)
+        copy_documents(sequence, writer, run.part)
         fields = {name: sequence.frames(name).tolist() for name in sequence.fields()}
         writer.expect(fields, typical_rows(sequence))
         blocks += blocks_of(sequence, writer, writer.block)
@@ -184,6 +191,8 @@ def _pack_blocks(share: Share, sequences: Mapping[str, Sequence], sink: ZarrSink
             sink.sequence(path).is_complete() for path in paths
         ):
             return False  # another part finishes the store
+    for writer in writers if run.part.count == 1 else ():
+        writer.remove_document(record_of(run.part))
     sink.finish()
     return True
 

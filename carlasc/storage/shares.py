@@ -5,11 +5,14 @@ before any of them is opened.
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 
-from carlasc.errors import MissingDataError
+from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.running.spreading import Run
+from carlasc.storage.files import AnyPath
+from carlasc.storage.layout import identity_of
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.transport.remote_tree import target_of
 from carlasc.storage.views import ChosenSequences
@@ -50,6 +53,33 @@ def source_in(source: Source, places: Collection[str]) -> Source:
     if [*places] == [""]:
         return source
     return ChosenSequences(source.location, source.sequences_in(places))
+
+
+def sample_of(
+    source: Source,
+    sample: int | None,
+    sequences_from: AnyPath | None = None,
+    name: str = "sample",
+) -> tuple[list[str], dict[str, int]]:
+    """Return evenly spaced folders of a source, and the number of all by split if there are more.
+
+    Args:
+        source: the source.
+        sample: about how many folders are returned. None: all.
+        sequences_from: see `read_list`.
+        name: name of the argument `sample`, for errors.
+
+    Raises:
+        ArgumentError: `sample` is less than 1.
+    """
+    if sample is not None and sample < 1:
+        raise ArgumentError(name, expected="1 or more", found=str(sample))
+    if sample is None and sequences_from is None:
+        return [""], {}
+    places = read_list(Run(sequences_from=sequences_from), source.places)
+    chosen = places[:: -(-len(places) // (sample or len(places)))]
+    splits = Counter(identity_of(f"{place}/cartesian")[0] or "none" for place in places)
+    return chosen, splits if len(chosen) < len(places) else {}
 
 
 def read_list(run: Run, places: Callable[[], list[str]]) -> list[str]:

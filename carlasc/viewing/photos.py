@@ -10,8 +10,13 @@ import numpy as np
 from carlasc.core.arrays import AnyArray, FloatArray
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import Transform, transform_points
-from carlasc.errors import FormatError, import_extra
-from carlasc.storage.camera_files import cameras_of, has_image, image_bytes, scan_T_camera
+from carlasc.storage.camera_files import (
+    cameras_of,
+    has_image,
+    image_bytes,
+    opened_image,
+    scan_T_camera,
+)
 from carlasc.storage.protocol import Sequence
 
 _PHOTO_PX, _FRUSTUM_M = 400, 1.0  # width of an image, and length of the drawn frustum of its camera
@@ -60,16 +65,10 @@ class Photo:
             FormatError: the image is damaged.
             DependencyError: Pillow is not installed.
         """
-        pillow = import_extra("PIL.Image", "render")
         out = io.BytesIO()
-        try:
-            with pillow.open(io.BytesIO(self.data)) as image:
-                image.thumbnail((width, self.camera.height))
-                image.convert("RGB").save(out, "JPEG", quality=_QUALITY)
-        except OSError as error:
-            raise FormatError(
-                f"image of {self.camera.name}", expected="a whole JPEG or PNG", found=str(error)
-            ) from error
+        with opened_image(self.data, f"image of {self.camera.name}") as image:
+            image.thumbnail((width, self.camera.height))
+            image.convert("RGB").save(out, "JPEG", quality=_QUALITY)
         return out.getvalue()
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import lzma
+import math
 import struct
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -19,7 +20,7 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray
 from carlasc.errors import FormatError, MissingDataError, import_extra
-from carlasc.storage.arrays import check_size
+from carlasc.storage.arrays import check_ratio, check_size
 from carlasc_converters.files import COPY, Version, opening, read_bytes, version_of
 
 SUFFIXES = (".zarr.itar", ".zarr")
@@ -27,7 +28,10 @@ _METADATA = ".zmetadata.cbor.xz"
 _BLOCK = 512
 _HEADER = struct.Struct("<4sIQI")  # magic, kind of index, its place, its size
 _CBOR_LZMA = 1
-_MOST_BYTES = 1 << 31  # of an index or of metadata, unpacked
+_SIZES = {"blosc": 4, "lz4": 0}  # codecs, and where their chunks have their size: others have no
+# bound, and that of pickles runs code
+_MOST_CHUNKS = 1 << 20  # of an array
+_STEP = 1 << 24  # bytes that are unpacked at once
 
 
 class NcoreStore:
@@ -59,7 +63,7 @@ class NcoreStore:
                     advice="upgrade carlasc",
                 )
             file.seek(place)
-            table = _unpacked(file.read(length))
+            table = _unpacked(file.read(length), self.path)
             return dict(
                 zip(
                     table["items"],
@@ -77,8 +81,9 @@ class NcoreStore:
             return None
         place, size = self._members[name]
         with opening(self.path, f"{size} bytes of {name}"), self.path.open("rb") as file:
+            end = file.seek(0, 2)
             file.seek(place)
-            data = file.read(size)
+            data = file.read(min(size, end))
         if len(data) < size:
             raise FormatError(
                 self.path, expected=f"{size} bytes of {name}", found=str(len(data)), advice=COPY
@@ -96,7 +101,7 @@ class NcoreStore:
                 advice="finish the store with NCore's writer",
             )
         with opening(self.path, "metadata of NCore"):
-            metadata: dict[str, Any] = _unpacked(data)["metadata"]
+            metadata: dict[str, Any] = _unpacked(data, self.path)["metadata"]
         return metadata
 
     def attributes(self, group: str = "") -> dict[str, Any]:
@@ -118,7 +123,7 @@ class NcoreStore:
 
         Raises:
             MissingDataError: the array does not exist.
-            FormatError: a chunk is damaged, or its codec is unknown.
+            FormatError: a chunk is damaged, has another size, or its codec is unknown.
             DependencyError: numcodecs is not installed.
         """
         about = self._metadata.get(f"{name}/.zarray")
@@ -129,7 +134,8 @@ class NcoreStore:
         where = f"{self.path}: {name}"
         with opening(where, "an array of zarr version 2"):
             shape, chunks = tuple(about["shape"]), tuple(about["chunks"])
-            check_size(shape, np.dtype(about["dtype"]), where)
+            for size in (shape, chunks):
+                check_size(size, np.dtype(about["dtype"]), where)
             values = np.full(shape, about["fill_value"] or 0, np.dtype(about["dtype"]))
             if about["order"] != "C" or about["filters"]:
                 raise FormatError(
@@ -137,17 +143,27 @@ class NcoreStore:
                     expected="rows in order C without filters",
                     found=f"{about['order']}, {about['filters']}",
                 )
-            codec = (
-                None
-                if about["compressor"] is None
-                else import_extra("numcodecs", "ncore").get_codec(about["compressor"])
-            )
+            config, codec = about["compressor"], None
+            if config is not None:
+                if config["id"] not in _SIZES:
+                    raise FormatError(where, expected="chunks of blosc", found=str(config["id"]))
+                codec = import_extra("numcodecs", "ncore").get_codec(config)
             counts = [-(-size // step) for size, step in zip(shape, chunks, strict=True)]
+            if math.prod(counts) > _MOST_CHUNKS:
+                expected = f"at most {_MOST_CHUNKS} chunks"
+                raise FormatError(where, expected=expected, found=str(math.prod(counts)))
+            length = math.prod(chunks) * values.itemsize
             for index in itertools.product(*map(range, counts)):
                 key = about.get("dimension_separator", ".").join(map(str, index)) or "0"
                 data = self._read(f"{name}/{key}")
                 if data is None:
                     continue  # an absent chunk holds the fill value only
+                if codec is not None:
+                    start = _SIZES[config["id"]]
+                    found = int.from_bytes(data[start : start + 4], "little")
+                    if found != length:
+                        expected = f"a chunk of {length} bytes"
+                        raise FormatError(where, expected=expected, found=f"one of {found}")
                 raw = data if codec is None else codec.decode(data)
                 part = np.frombuffer(raw, values.dtype).reshape(chunks)
                 place = tuple(
@@ -172,9 +188,13 @@ def _open(path: str, version: Version) -> NcoreStore:
     return NcoreStore(path)
 
 
-def _unpacked(data: bytes) -> Any:
-    decoder = lzma.LZMADecompressor()
-    text = decoder.decompress(data, _MOST_BYTES)
-    if not decoder.eof:
-        raise ValueError("compressed data that end too early, or are too large")
+def _unpacked(data: bytes, where: Path) -> Any:
+    decoder, text, packed = lzma.LZMADecompressor(), bytearray(), len(data)
+    while not decoder.eof:
+        part = decoder.decompress(data, _STEP)
+        if not part and decoder.needs_input:
+            raise ValueError("compressed data that end too early")
+        text += part
+        check_ratio(len(text), packed, str(where))
+        data = b""
     return import_extra("cbor2", "ncore").loads(text)

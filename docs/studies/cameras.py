@@ -68,12 +68,12 @@ def main() -> None:
     given = parser.parse_args()
     print(
         "| seed | points that a camera sees, labelled | of these right | of all these right | "
-        "voxels right, 90 % |"
+        "voxels right, 90% |"
     )
     for seed in given.seeds:
         folder = _drive(given.work / f"{given.size}{seed}", seed, FRAMES[given.size])
         print(
-            f"| {seed} | {' | '.join(f'{100 * share:.1f} %' for share in labels_of(folder, seed))} "
+            f"| {seed} | {' | '.join(f'{100 * share:.1f}%' for share in labels_of(folder, seed))} "
             f"|",
             flush=True,
         )
@@ -85,7 +85,7 @@ def main() -> None:
         for name in GRIDS:
             shares = seen_of(given.work / f"{given.size}{seed}", name, JUDGED[given.size])
             print(
-                f"| {seed} | {name} | {' | '.join(f'{share:.2f} %' for share in shares)} |",
+                f"| {seed} | {name} | {' | '.join(f'{share:.2f}%' for share in shares)} |",
                 flush=True,
             )
     plain_measures(folder / "drive")
@@ -155,7 +155,7 @@ def tracked_boxes(real: Path) -> None:
             errors.setdefault(f"{row[2]} {row[1]}", []).append(off)
     for name, found in errors.items():
         off = np.array(found).max(axis=1)
-        print(f"| {name} | {len(off)} | {100 * (off < 2).mean():.0f} % | {off.max():.1f} |")
+        print(f"| {name} | {len(off)} | {100 * (off < 2).mean():.0f}% | {off.max():.1f} |")
 
 
 def agreement_of(folder: Path) -> None:

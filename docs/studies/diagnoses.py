@@ -83,7 +83,7 @@ def errors_of(name: str, poses: Poses, seed: int) -> Poses:
     }
     if name in added:
         return wrong_poses(poses, **added[name], seed=seed)
-    if name == "scale of 3 %":
+    if name == "scale of 3%":
         motions[:, :3, 3] = 1.03 * way
     elif name == "distortion in turns":  # short and aslant where the sensor turns
         motions[:, 0, 3] -= 0.1 * np.abs(turns[:, 2]) * np.abs(way[:, 0])
@@ -103,7 +103,7 @@ ERRORS = (
     "jitter of 8 cm, 0.3 degrees",
     "drift of 1 cm, 0.05 degrees",
     "drift of 3 cm, 0.15 degrees",
-    "scale of 3 %",
+    "scale of 3%",
     "distortion in turns",
     "short and pitched",
 )

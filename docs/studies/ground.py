@@ -63,14 +63,14 @@ CASES = (
     ),
     Case("rolled by 3 degrees", mounts=((-0.5, 0.0, HEIGHT_M, 3.0, 0.0),)),
     Case("pitched by 3 degrees", mounts=((-0.5, 0.0, HEIGHT_M, 0.0, 3.0),)),
-    Case("slope of 8 %", bend=lambda p: 0.08 * p[:, 0]),
+    Case("slope of 8%", bend=lambda p: 0.08 * p[:, 0]),
     Case("top of a hill", bend=lambda p: -0.0015 * p[:, 0] ** 2),
     Case("bottom of a dip", bend=lambda p: 0.0015 * p[:, 0] ** 2),
     Case(
         "three sensors merged",
         mounts=((0, 0, HEIGHT_M, 0, 0), (2.2, 0.9, 0.8, 0, 2), (-2.2, -0.9, 1.2, 3, 0)),
     ),
-    Case("0.5 % of points below the ground", below=0.005),
+    Case("0.5% of points below the ground", below=0.005),
 )
 
 

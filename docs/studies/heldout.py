@@ -21,7 +21,7 @@ from carlasc.inspection import HeldOutScores, holdout
 RULES = {
     row.name: row.observe for row in ROWS if row.name in ("tube", "current", "align, instances")
 }
-RULES |= {"align, evidence": EVIDENCE}
+RULES |= {"align, free space": EVIDENCE}
 
 
 def main() -> None:

@@ -66,9 +66,9 @@ def confused(labels: Labels, points: NDArray[np.float64], frame: int) -> Labels:
 RIGHT, MAY_BE_FREE = "right", "right, and own returns may be free"
 CASES: dict[str, Callable[[Labels, NDArray[np.float64], int], Labels] | None] = {
     RIGHT: None,
-    "20 % wrong, at random": at_random,
-    "25 % wrong, in clumps of 1 m": in_clumps,
-    "20 % confused with one other class": confused,
+    "20% wrong, at random": at_random,
+    "25% wrong, in clumps of 1 m": in_clumps,
+    "20% confused with one other class": confused,
     MAY_BE_FREE: None,
 }
 

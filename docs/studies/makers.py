@@ -214,7 +214,7 @@ MAKERS: dict[str, tuple[str | None, Maker]] = {  # name -> (module that it needs
     "SurroundOcc's recipe": (None, surroundocc),
     "ours, flow": (None, merged(FromScans(WINDOW, motion=MotionOptions("flow")))),
     "ours, instances": (None, merged(FromScans(WINDOW, motion=MotionOptions("instances")))),
-    "ours, nothing": (None, merged(FromScans(WINDOW, motion=MotionOptions("evidence")))),
+    "ours, free space": (None, merged(FromScans(WINDOW, motion=MotionOptions("evidence")))),
 }
 
 

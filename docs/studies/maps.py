@@ -107,9 +107,9 @@ ROWS = (
     MapRow("carlasc, flow", MotionOptions("flow")),
     MapRow("carlasc, exact boxes", MotionOptions("boxes")),
     MapRow("carlasc, boxes", MotionOptions("boxes"), lambda drive: noisy_boxes(drive, 0)),
-    MapRow("carlasc, nothing", MotionOptions("evidence")),
+    MapRow("carlasc, free space", MotionOptions("evidence")),
     MapRow(
-        "carlasc, nothing, no labels",
+        "carlasc, free space, unlabelled",
         MotionOptions("evidence"),
         lambda drive: Only(drive.sequence, BARE),
     ),

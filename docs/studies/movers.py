@@ -46,8 +46,8 @@ from carlasc.storage.files import write_atomic
 SEEDS = {kind: movers_drives.SEEDS[kind] for kind in ("town", "street")}
 WINDOW = (-30, 30)  # scans that show the sides of actors
 PARTS = ("rules", "lidars", "errors", "held out")  # of the page
-UNCHANGED = ("align, flow", "align, instances", "align, evidence")  # beside the ablations
-HELD_OUT = ("tube", "current", "align, flow", "align, exact boxes", "align, evidence")
+UNCHANGED = ("align, flow", "align, instances", "align, free space")  # beside the ablations
+HELD_OUT = ("tube", "current", "align, flow", "align, exact boxes", "align, free space")
 BY_NAME = {row.name: row for row in (*ROWS, *ABLATIONS)}
 
 
@@ -84,7 +84,7 @@ def tasks_of(given: argparse.Namespace) -> list[Task]:
     if given.parked:
         return [Task(Setting("parked", seed, 64), tuple(GRIDS), parked, work) for seed in (1, 2, 3)]
     if study.is_tiny():
-        some = ("tube", "align, flow", "align, evidence", UNLABELLED)
+        some = ("tube", "align, flow", "align, free space", UNLABELLED)
         return [Task(Setting(*study.drives(given, SEEDS)[0], 32), ("coarse",), some, work)]
     by_kind = [[(kind, seed) for seed in getattr(given, kind)] for kind in SEEDS]
     drives: list[tuple[str, int]] = [drive for pair in zip(*by_kind, strict=True) for drive in pair]

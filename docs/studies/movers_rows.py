@@ -21,7 +21,7 @@ from carlasc.storage import Sequence
 
 SEED = 12  # of all noise that is added
 BARE = ("points",)
-UNLABELLED = "align, evidence, no labels"
+UNLABELLED = "align, free space, unlabelled"
 Keep = Callable[[int], NDArray[np.bool_]]
 
 
@@ -275,13 +275,13 @@ ROWS = (
     Row("align, instances", _merging(motion=MotionOptions("instances"))),
     Row("align, boxes", _merging(motion=MotionOptions("boxes")), noisy_boxes),
     Row("align, exact boxes", _merging(motion=MotionOptions("boxes"))),
-    Row("align, evidence", _merging(motion=MotionOptions("evidence"))),
+    Row("align, free space", _merging(motion=MotionOptions("evidence"))),
     Row(UNLABELLED, _merging(motion=MotionOptions("evidence")), without_labels),
 )
 """The rows of the tables."""
 
 EVIDENCE = _merging(motion=MotionOptions("evidence"))
-_HINTS = {"flow": FLOW, "evidence": EVIDENCE}
+_HINTS = {"flow": FLOW, "free space": EVIDENCE}
 ABLATIONS = (
     *(
         Row(f"{hint}, poses {text}", observe, NoisyPoses(metres, degrees))
@@ -299,7 +299,7 @@ ABLATIONS = (
         for hint, observe in _HINTS.items()
         for frames in (5, 15)
     ),
-    Row("instances, 10 % wrong ids", _merging(motion=MotionOptions("instances")), wrong_ids),
+    Row("instances, 10% wrong ids", _merging(motion=MotionOptions("instances")), wrong_ids),
 )
 """What is changed one at a time, at 32 channels on the coarse grid.
 

@@ -164,13 +164,13 @@ class Table:
         }
 
 
-CALIBRATED = ("align, flow", "align, evidence")
+CALIBRATED = ("align, flow", "align, free space")
 MOVERS_OF = (
     "tube",
     "perfect removal, then tube",
     "align, flow",
     "align, boxes",
-    "align, evidence",
+    "align, free space",
     UNLABELLED,
 )
 

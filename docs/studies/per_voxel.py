@@ -13,7 +13,7 @@ known to both count. WORK keeps the drives; the default is a temporary folder.
 - velocity: mean length of the difference over the voxels that move in both, m/s; beside it the
   share of the moving voxels that have one.
 
-The tables are means over the drives of each world, with 95 % intervals over them.
+The tables are means over the drives of each world, with 95% intervals over them.
 """
 
 from __future__ import annotations
@@ -49,14 +49,14 @@ MANY_POINTS, SEEN = 50, 0.5
 THINGS = frozenset({CARLA.id_of("Vehicle"), CARLA.id_of("Pedestrian")})
 
 
-ROWS = ("instances", "flow", "exact boxes", "boxes", "evidence", "evidence, no labels")
+ROWS = ("instances", "flow", "exact boxes", "boxes", "free space", "free space, unlabelled")
 
 
 def merged_from(drive: Recorded, row: str) -> tuple[Sequence, FromScans]:
     """Return what a row merges, and how."""
-    source = "boxes" if "boxes" in row else row.partition(",")[0]
+    source = "boxes" if "boxes" in row else "evidence" if "free space" in row else row
     observe = FromScans(own_path=False, motion=MotionOptions(source))  # type: ignore[arg-type]
-    if row == "evidence, no labels":
+    if row == "free space, unlabelled":
         return Only(drive.sequence, BARE), observe
     return Only(
         noisy_boxes(drive, 0) if row == "boxes" else drive.sequence, {source, "points", "labels"}
@@ -208,7 +208,7 @@ def score_row(
         assert merged.actors is not None  # the plan keeps them
         labels = merged.grid.labels
         # the class is not known: that of the truth, where both are occupied
-        if row.endswith("no labels"):
+        if row.endswith("unlabelled"):
             own = np.isin(seen[frame].labels, sorted(THINGS)) | (labels == 0)
             labels = np.where(labels > 0, np.where(own, seen[frame].labels, min(THINGS)), 0)
         score.add((labels, merged.grid.known, merged.actors), seen[frame], truth)

@@ -57,7 +57,7 @@ ROWS = {
 }
 SCANS = {  # channels, every which scan is used, and whether scans have labels
     "32 channels": (32, 1, True),
-    "32 channels, no labels": (32, 1, False),
+    "32 channels, unlabelled": (32, 1, False),
     "16 channels": (16, 1, True),
     "64 channels": (64, 1, True),
     "32 channels at 2 Hz": (32, 5, True),
@@ -183,10 +183,10 @@ def figures(counts: NDArray[np.int64]) -> NDArray[np.float64]:
 
 def table(tasks: Sequence[Task], grid: str) -> str:
     """Return the means over drives, as a table, with the smallest share of a single drive that is
-    won back.
+    recovered.
     """
     lines = [
-        f"| poses | refined | {' | '.join(FIGURES)} | won back |",
+        f"| poses | refined | {' | '.join(FIGURES)} | recovered |",
         "|---" * (len(FIGURES) + 3) + "|",
     ]
     exact = np.zeros(0)

@@ -39,9 +39,9 @@ SPEC = GridSpec.published().with_resolution(0.2)
 RULES = {  # name -> whether labels and boxes are given, what observes
     "tube": (True, FromScans(window=WINDOW, dynamic="tube")),
     "align, boxes": (True, FromScans(window=WINDOW, motion=MotionOptions("boxes"), own_path=False)),
-    "align, boxes, and evidence": (True, FromScans(window=WINDOW, own_path=False)),
-    "tube, no labels": (False, FromScans(window=WINDOW, dynamic="tube")),
-    "align, no labels": (False, FromScans(window=WINDOW, own_path=False)),
+    "align, boxes and free space": (True, FromScans(window=WINDOW, own_path=False)),
+    "tube, unlabelled": (False, FromScans(window=WINDOW, dynamic="tube")),
+    "align, free space, unlabelled": (False, FromScans(window=WINDOW, own_path=False)),
 }
 
 

@@ -108,7 +108,7 @@ def labels_of(scan: Scan) -> NDArray[np.unsignedinteger]:
 
 
 def interval(values: Iterable[float], shown: str = ".2f") -> str:
-    """Return the mean over drives, with its 95 % interval by Student's t if there are several."""
+    """Return the mean over drives, with its 95% interval by Student's t if there are several."""
     found = np.array([value for value in values if not np.isnan(value)], np.float64)
     if len(found) < 2:
         return f"{found.mean():{shown}}" if len(found) else ""

@@ -23,11 +23,11 @@ from carlasc.testing import wrong_labels
 SEEDS, FIRST, FRAMES, MIDDLE = {"town": range(5)}, 100, 61, 30  # a drive starts at rest
 SPEC = carlasc.GridSpec.published("cartesian").with_resolution(0.2)
 CASES = {
-    "20 % of the points, at random": (0.2, None, False),
-    "20 %, in clumps of 1 m, others in each scan": (0.2, 1.0, False),
-    "20 %, in clumps of 1 m, the same in all scans": (0.2, 1.0, True),
-    "40 % of the points, at random": (0.4, None, False),
-    "40 %, in clumps of 1 m, others in each scan": (0.4, 1.0, False),
+    "20% of the points, at random": (0.2, None, False),
+    "20%, in clumps of 1 m, others in each scan": (0.2, 1.0, False),
+    "20%, in clumps of 1 m, the same in all scans": (0.2, 1.0, True),
+    "40% of the points, at random": (0.4, None, False),
+    "40%, in clumps of 1 m, others in each scan": (0.4, 1.0, False),
 }
 
 

@@ -7,7 +7,7 @@ labels:
     evaluation  capture truth: what all sensors of a capture saw at the instant of the frame
     tube        the scans around the frame, merged as they are (SemanticKITTI): what moves leaves
     traces align       the same scans, with each moving actor completed at its place in the frame;
-    with the probability of each class wrong       as align, but 20 % of the points of each scan
+    with the probability of each class wrong       as align, but 20% of the points of each scan
     have a wrong label, in clumps of 1 m
 """
 
@@ -152,7 +152,7 @@ def merge_scans(folder: Path, scenes: Scenes, workers: int | None) -> None:
 
 
 def write_wrong_labels(drive: Path, out: Path) -> None:
-    """Write labels of all scans of a drive, of which 20 % are wrong: in clumps of 1 m, which are
+    """Write labels of all scans of a drive, of which 20% are wrong: in clumps of 1 m, which are
     others in each scan.
     """
     out.mkdir()

@@ -55,7 +55,7 @@ def label_rows(size: Size) -> list[Row]:
     labels = {
         "tube": replace(plain, grid="tube"),
         "align": replace(plain, grid="align"),
-        "align, 20 % of the points wrong": replace(plain, grid="wrong"),
+        "align, 20% of the points wrong": replace(plain, grid="wrong"),
         "align, soft labels": replace(plain, grid="align", soft_labels=True),
         CAPTURE_TRUTH: plain,
     }

@@ -83,7 +83,7 @@ SIZES = {
     ),
     "small": Size(Scenes((6, 2, 4), 11, 15, 12, _NEAR, 6.4, (32, 32, 8)), 3, 1, 1, batch_size=2),
     "medium": Size(
-        Scenes((10, 3, 8), 11, 15, 12, _NEAR, 6.4, (32, 32, 8)), 18, 6, 6, batch_size=2, seeds=3
+        Scenes((10, 3, 8), 11, 15, 12, _NEAR, 6.4, (32, 32, 8)), 18, 6, 6, batch_size=2, seeds=5
     ),
     "long": Size(Scenes((20, 4, 12), 21, 15, 12, _NEAR, 6.4, (32, 32, 8)), 10, 3, 3, seeds=3),
     "full": Size(

@@ -103,7 +103,7 @@ def figure_table(
 
 def difference(first: Sequence[Result], second: Sequence[Result], figure: Figure) -> Interval:
     """Return by how much a figure of the first runs is higher than that of the second, and its
-    95 % interval, which holds for other towns and other seeds; with one run of each, for other
+    95% interval, which holds for other towns and other seeds; with one run of each, for other
     towns only.
 
     The variance over test drives is that of the difference, because both are tested on the same;

@@ -2,7 +2,7 @@
 
 A small grid where benchmarks are off.
 
-`numpy` is what it is measured by: `numpy.savez_compressed`, whose file is 3 % smaller.
+`numpy` is what it is measured by: `numpy.savez_compressed`, whose file is 3% smaller.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Run by test_ncore.py in an environment with NCore's own library: writes what is given as a store,
 and what the library reads of it.
 
-Usage: python ncore_library.py FOLDER, with given.npz and given.json in it.
+Usage: python ncore_library.py FOLDER, with given.npz and given.json in it, or with a store.
 """
 
 import json
@@ -101,6 +101,8 @@ def read(paths):
 
 if __name__ == "__main__":
     place = Path(sys.argv[1])
-    with np.load(place / "given.npz") as arrays:
-        written = write(place, arrays, json.loads((place / "given.json").read_text()))
+    written = [UPath(path) for path in place.glob("*.itar")]
+    if not written:
+        with np.load(place / "given.npz") as arrays:
+            written = write(place, arrays, json.loads((place / "given.json").read_text()))
     np.savez(place / "library.npz", **read(written))

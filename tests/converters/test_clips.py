@@ -9,7 +9,9 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -21,7 +23,8 @@ from helpers.servers.object_store import BUCKET, client_of, environment_for, s3_
 from carlasc import Run
 from carlasc.converting import LayoutOptions, convert
 from carlasc.errors import ArgumentError
-from carlasc.running import Part
+from carlasc.running import Part, open_cluster
+from carlasc.storage.inputs import combined
 from carlasc.testing import SimulatedDrive
 
 pytestmark = pytest.mark.needs("cbor2", "numcodecs")
@@ -119,11 +122,10 @@ def convert_whole(folder: Path, files: dict[str, bytes]) -> dict[str, bytes]:
 
 def sizes(folder: Path) -> int:
     total = 0
-    for path in folder.rglob("*"):
-        try:
-            total += path.stat().st_size if path.is_file() else 0
-        except FileNotFoundError:
-            continue
+    for place, _, names in os.walk(folder):  # passes over folders that are being deleted
+        for name in names:
+            with contextlib.suppress(FileNotFoundError):
+                total += Path(place, name).stat().st_size
     return total
 
 
@@ -179,3 +181,37 @@ def test_two_killed_machines_convert_many_clips_once_in_bounded_space(tmp_path, 
     failed = sorted(one["sequence"] for one in results[1]["failures"] + results[2]["failures"])
     assert failed == ["bad.ncore4.zarr.itar", "gone.ncore4.zarr.itar", "large.ncore4.zarr.itar"]
     assert scans(tmp_path / "out") == convert_whole(tmp_path / "in", files)
+
+
+@pytest.mark.slow
+@pytest.mark.needs("distributed")
+def test_each_clip_is_a_task_of_a_cluster_and_all_tasks_share_the_scratch(tmp_path, monkeypatch):
+    scratch, ended, largest = tmp_path / "scratch", threading.Event(), [0]
+    scratch.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(scratch))
+    files = write_clips(tmp_path / "in", 6)
+    damaged = "/damaged.ncore4.zarr.itar"
+    path = listed(tmp_path, *files, damaged, "gone.ncore4.zarr.itar")
+    space = 3 * max(map(len, files.values())) // 2  # for one clip of three workers
+    out = tmp_path / "out"
+    dead = scratch / f"carlasc-{combined(str(out), '1/1')}" / "clip"  # of a worker that was killed
+    dead.mkdir(parents=True)
+    (dead / "data").write_bytes(bytes(space))
+
+    def watch() -> None:
+        while not ended.wait(0.005):
+            largest[0] = max(largest[0], sizes(scratch))
+
+    with (
+        serve(Site(files | {damaged: b"not a store"})) as site,
+        ThreadPoolExecutor(1) as pool,
+        open_cluster("local:3") as cluster,
+    ):
+        pool.submit(watch)
+        run = Run(executor=cluster, sequences_from=path)
+        result = convert("ncore", site.url, out, grids=None, scratch=f"{space}B", run=run)
+        ended.set()
+    assert result.made == 12 and 0 < largest[0] <= space
+    assert sorted(Path(one.sequence).name[:4] for one in result.failures) == ["dama", "gone"]
+    assert scans(out) == convert_whole(tmp_path / "in", files)
+    assert not list(scratch.glob("carlasc-*/*"))

@@ -215,8 +215,12 @@ def library(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_what_the_library_writes_is_read_as_the_library_reads_it(tmp_path, library):
-    for_library(tmp_path, contents(DRIVE))
+@pytest.mark.parametrize("writer", ["the library", "the tests"])
+def test_a_store_is_read_as_the_library_reads_it(tmp_path, library, writer):
+    if writer == "the library":
+        for_library(tmp_path, contents(DRIVE))
+    else:
+        write_store(tmp_path, DRIVE)
     script = Path(__file__).with_name("ncore_library.py")
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run(

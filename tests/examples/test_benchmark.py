@@ -201,7 +201,7 @@ def test_every_row_trains_as_its_paper_says():
     assert {name: row.config.grid for name, row in labels.items()} == {
         "tube": "tube",
         "align": "align",
-        "align, 20 % of the points wrong": "wrong",
+        "align, 20% of the points wrong": "wrong",
         "align, soft labels": "align",
         "capture truth": "evaluation",
     }

@@ -147,7 +147,7 @@ def test_occ3d_names_scenes_frames_and_poses(occ3d):
 
 def test_occ3d_says_what_is_lost_and_how_to_make_the_exact_grid(occ3d):
     notes = " ".join(occ3d[1].notes)
-    assert "the grid small covers 3 % of the volume" in notes
+    assert "the grid small covers 3% of the volume" in notes
     assert "--size 200,200,16 --bounds -40,40,-40,40,-2.8,3.6 --name occ3d" in notes
     assert "larger" not in notes
 
@@ -160,7 +160,7 @@ def test_clouds_without_rays_are_not_sent_to_regrid_which_refuses_them(source, t
     notes = " ".join(
         export("occ3d", tmp_path / "tiles", tmp_path / "out", run=Run(workers=1)).notes
     )
-    assert "the grid small covers 3 % of the volume" in notes
+    assert "the grid small covers 3% of the volume" in notes
     assert "regrid" not in notes
 
 

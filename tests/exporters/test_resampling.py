@@ -115,4 +115,4 @@ def test_notes_say_what_is_lost():
     (small,) = resampling_notes(
         spec_of((10, 20, 10), (0.0, -2.0, -1.0), (2.0, 2.0, 1.0)), target, "half"
     )
-    assert small == "the grid half covers 50 % of the volume that is written: the rest is unknown"
+    assert small == "the grid half covers 50% of the volume that is written: the rest is unknown"

@@ -188,6 +188,15 @@ class TestBodies:
         label, count, flags = at(self.make(tmp_path / "seen", beyond=beyond), roof)
         assert (label, count > 0) == (0, True) and VoxelFlag.INFERRED not in flags
 
+    def test_the_space_above_a_roof_over_which_rays_passed_is_free_and_marked(self, tmp_path):
+        over = np.array([0.3, 4.1, 1.3])  # just above the body
+        beyond = [(tuple((1 + 0.1 * i) * 2 * over), BUILDING) for i in range(10)]
+        higher = (0.3, 4.1, 1.7)
+        label, count, flags = at(self.make(tmp_path / "body", beyond=beyond), higher)
+        assert (label, count) == (0, 1) and VoxelFlag.INFERRED in flags
+        for name, options in (("seen", {"complete": "seen", "beyond": beyond}), ("none", {})):
+            assert at(self.make(tmp_path / name, **options), higher)[1] == 0
+
     @pytest.mark.parametrize("complete", ["seen", "mirror", "body"])
     def test_a_body_does_not_swallow_the_road(self, tmp_path, complete):
         merged = self.make(tmp_path, complete=complete)

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,10 @@ from helpers.scenes.passing_car import write_sequence
 import carlasc
 from carlasc import FromGrid, FromScans, GridSpec, Run, Voting, regrid
 from carlasc.converting import convert, export
+from carlasc.converting.stages import Conversion
 from carlasc.core import CameraModel
 from carlasc.errors import ArgumentError
+from carlasc.groundtruth.inputs import InputCheck
 from carlasc.motion import PoseOptions
 from carlasc.running import Part, open_cluster
 from carlasc.storage import layout
@@ -368,6 +371,36 @@ def test_a_capture_without_its_last_frame(tmp_path):
         path.unlink()
     regrid(tmp_path / "data", SPEC, tmp_path / "out", run=ALONE)
     regrid(tmp_path / "data", SPEC, tmp_path / "fresh", run=ALONE)
+    assert outputs(tmp_path / "out") == outputs(tmp_path / "fresh")
+
+
+def test_frames_that_are_lost_after_a_run_was_killed_at_its_begin(tmp_path, monkeypatch):
+    write_capture(tmp_path / "data", frames=2)
+    with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
+        killed.setattr(InputCheck, "look", lambda *arguments: os.kill(os.getpid(), signal.SIGINT))
+        regrid(tmp_path / "data", SPEC, tmp_path / "out", run=ALONE)
+    assert len((tmp_path / "out/cartesian/times.txt").read_text().split()) == 2
+    for path in (tmp_path / "data/raw").glob("*/101.npy"):
+        path.unlink()
+    regrid(tmp_path / "data", SPEC, tmp_path / "out", run=ALONE)
+    regrid(tmp_path / "data", SPEC, tmp_path / "fresh", run=ALONE)
+    assert outputs(tmp_path / "out") == outputs(tmp_path / "fresh")
+
+
+@pytest.mark.slow
+def test_scans_that_are_lost_after_convert_was_killed_at_its_begin(tmp_path, monkeypatch):
+    write_tiny_kitti(tmp_path / "kitti", frames=3)
+    with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
+        killed.setattr(
+            Conversion, "_read_scans", lambda *arguments: os.kill(os.getpid(), signal.SIGINT)
+        )
+        convert("kitti", tmp_path / "kitti", tmp_path / "out", grids=None, poses=FORCED, run=ALONE)
+    (text,) = (tmp_path / "out").rglob("times.txt")
+    assert len(text.read_text().split()) == 3
+    for path in (tmp_path / "kitti").rglob("000002.*"):
+        path.unlink()
+    for name in ("out", "fresh"):
+        convert("kitti", tmp_path / "kitti", tmp_path / name, grids=None, poses=FORCED, run=ALONE)
     assert outputs(tmp_path / "out") == outputs(tmp_path / "fresh")
 
 

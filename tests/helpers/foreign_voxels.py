@@ -97,7 +97,7 @@ def ids(grid, names, to, *, free, first):
 
 
 def noisy(labels, free, seed):
-    """Return a prediction: a tenth of the occupied voxels is free, and 3 % have another class."""
+    """Return a prediction: a tenth of the occupied voxels is free, and 3% have another class."""
     rng, pred = np.random.default_rng(seed), labels.copy()
     chance = np.where(labels == free, 1.0, rng.random(labels.shape))
     pred[chance < 0.13] = rng.choice(np.unique(labels[labels != free]))

@@ -271,7 +271,7 @@ def test_a_mistake_in_a_minority_of_frames_is_not_reported():
 def test_a_mistake_is_reported_from_one_percent_of_the_points(part, reported):
     points, _, grid = scene(count=20_000)
     labels = np.minimum(grid.labels, grid.labels[:, ::-1])  # y mirrored makes no difference,
-    labels[part] = grid.labels[part]  # but for this part: 5 %, or 0.8 % of the grid
+    labels[part] = grid.labels[part]  # but for this part: 5%, or 0.8% of the grid
     cells, _ = SPEC.index(points)
     result = diagnose(
         points * [1, -1, 1], labels[tuple(cells.T)], Grid(SPEC, labels, grid.counts), frames=4

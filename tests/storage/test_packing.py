@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -24,6 +26,7 @@ import carlasc
 from carlasc import Run
 from carlasc.cli import app
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError
+from carlasc.running import Part
 from carlasc.storage import FolderSink, FolderSource, pack, unpack
 from carlasc.storage.packed.stores import PackOptions
 
@@ -394,15 +397,55 @@ def test_what_another_source_left_is_not_mixed_with_this_one(data: Path, tmp_pat
     subprocess.run(
         [sys.executable, "-c", KILLED, "pack", data, tmp_path / "x.zarr", "1"], check=False
     )
-    other = write_dataset(tmp_path / "other", seed=1)
-    (other / PATH / "carlasc.json").write_bytes(b"{}")
+    same = shutil.copytree(data, tmp_path / "same")
+    (same / PATH / "carlasc.json").write_bytes(b"{}")
     with raises(
         ConflictError,
         where=r"carlasc\.json",
         expected="the text file of this source",
         found="a different file",
     ):
+        pack(same, tmp_path / "x.zarr")
+    other = write_dataset(tmp_path / "other", seed=1)
+    with raises(ConflictError, expected="in the earlier run", found="files that changed"):
         pack(other, tmp_path / "x.zarr")
+
+
+def kill(run: str, source: Path, out: Path, files: int) -> None:
+    subprocess.run([sys.executable, "-c", KILLED, run, source, out, str(files)], check=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [*KINDS, "files"])
+def test_a_source_that_changes_after_a_kill_is_not_mixed_with_the_old_one(
+    data: Path, tmp_path: Path, kind: str
+) -> None:
+    source, out = shutil.copytree(data, tmp_path / "data"), tmp_path / f"x.{kind}"
+    run = unpack if kind == "files" else pack
+    kill(run.__name__, source, out, 999)
+    path = min((source / PATH / "velodyne").iterdir())
+    path.write_bytes(np.frombuffer(path.read_bytes(), np.float32)[::-1].tobytes())
+    if kind in ("zarr", "files"):
+        with raises(ConflictError, where=r"x\.", found="files that changed"):
+            run(source, out)
+        for left in (out, out.with_name(f"{out.name}.part")):
+            shutil.rmtree(left, ignore_errors=True)
+    run(source, out)
+    if kind != "files":
+        unpack(out, tmp_path / "files")
+    assert files_of(out if kind == "files" else tmp_path / "files") == files_of(source)
+
+
+def test_a_part_that_runs_again_sees_that_its_source_changed(data: Path, tmp_path: Path) -> None:
+    source, first = shutil.copytree(data, tmp_path / "data"), Run(part=Part(1, 2))
+    unpack(source, tmp_path / "out", run=first)
+    kept = unpack(source, tmp_path / "out", run=first)
+    assert kept.kept and not kept.files
+    for path in source.rglob("velodyne/*.bin"):
+        os.utime(path, ns=(0, 0))
+    with raises(ConflictError, found="files that changed"):
+        unpack(source, tmp_path / "out", run=first)
+    assert unpack(source, tmp_path / "out", run=Run(part=Part(2, 2))).files  # it may read a copy
 
 
 def test_a_killed_unpack_continues_file_by_file(data: Path, tmp_path: Path) -> None:

@@ -55,8 +55,8 @@ _ACTOR_POINTS = (
     400  # greatest number of points of an actor in one scan, for its motion and its body
 )
 _SAMPLES = 5  # number of scans that decide whether labels name the ground
-# greatest share of ground points with other classes: walls and kerbs give 2 to 4 %, labels that are
-# often wrong 15 %
+# greatest share of ground points with other classes: walls and kerbs give 2 to 4%, labels that are
+# often wrong 15%
 _OTHERWISE = 0.1
 # fields of a scan that are read for merging
 _USED = (

@@ -23,6 +23,7 @@ from carlasc.core.arrays import (
 from carlasc.core.cells import count_points
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
+from carlasc.groundtruth.from_scans.above import find_above
 from carlasc.groundtruth.from_scans.actor_voxels import find_voxels
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import STATIC, BodyRegions, Instant, Merger
@@ -45,6 +46,7 @@ from carlasc.motion.tracks import MovingActors
 # The volume that is inside of any recording vehicle: metres around the sensor.
 _OWN_LOWER, _OWN_UPPER = np.array([-2.2, -0.75, -1.2]), np.array([2.2, 0.75, 0.0])
 _OWN_PROBABILITY = 0.01
+_ABOVE_PROBABILITY = 0.01  # of an unknown voxel above a body
 _RETURNED_PROBABILITY = 0.6  # of a voxel with a return of this scan that other scans saw free
 # Hits per metre of free path in a voxel with a return of the frame's own scan, below which this
 # return is an outlier: with other returns around it, and without.
@@ -129,6 +131,9 @@ def merge_frame(
     # Last, because what the frame's own scan saw is stronger than all inferences above.
     if consensus is not None:
         steps.keep_returns(made, votes, consensus)
+    above = _NO_VOXELS
+    if options.complete != "seen" and options.dynamic != "tube":
+        above = steps.free_above(made)
     who = steps.actors(made.labels)
     if feed.must_find_ground:  # ground that was found had a class for the votes only
         made.labels[np.isin(made.labels, sorted(classes.ground))] = classes.geometry_id
@@ -136,7 +141,7 @@ def merge_frame(
     grid = Grid(plan.spec, made.labels.reshape(size), made.counts.reshape(size))
     if made.occupied is None:
         return FrameData({}, grid, votes, None, who, votes.boxes)
-    inferred = np.concatenate([_NO_VOXELS, *(voxels for voxels, _ in completed)])
+    inferred = np.concatenate([above, *(voxels for voxels, _ in completed)])
     flags, shares = (
         steps.flags(inferred, contested, seen_now),
         _join_shares(votes, consensus, completed, classes),
@@ -414,6 +419,17 @@ class _FrameSteps:
         kept = lost[is_kept]
         made.labels[kept], made.counts[kept] = consensus.labels[kept], (hits + free)[is_kept]
         made.set_probability(kept, _RETURNED_PROBABILITY)
+
+    def free_above(self, made: _UnfinishedGrid) -> IntArray:
+        """Make unknown voxels above vehicles and people free; return them."""
+        classes, solid = self.feed.classes, made.labels > 0
+        bodies = solid & self.in_body & ~np.isin(made.labels, sorted(classes.ground))
+        if self.feed.has_labels:
+            bodies |= np.isin(made.labels, sorted(classes.movable))
+        voxels = find_above(solid, made.counts > 0, bodies, self.plan.spec)
+        made.counts[voxels] = 1
+        made.set_probability(voxels, _ABOVE_PROBABILITY)
+        return voxels
 
     def driven(self, made: _UnfinishedGrid) -> IntArray:
         """Return the occupied voxels on the ego path of other frames, without ground, bodies and

@@ -176,7 +176,7 @@ def _sound_or_not(fit: _Fit, where: str) -> Verdict:
     else:
         found = (fit.value, low, high)
         small = "" if fit.value == neutral else ", too little to matter"
-        text = f"{fit.value:.3g} {family.unit} (95 %: {low:.3g} to {high:.3g}){small}"
+        text = f"{fit.value:.3g} {family.unit} (95%: {low:.3g} to {high:.3g}){small}"
         if high - low > family.widest:
             unclear = f"any value from {low:.3g} to {high:.3g} {family.unit} fits this drive"
     if not fit.is_measured:
@@ -188,7 +188,7 @@ def _sound_or_not(fit: _Fit, where: str) -> Verdict:
 
 def _describe(fit: _Fit, one: MatchedGrids) -> str:
     value, (low, high), name = fit.value, fit.interval, fit.family.name
-    ends = f"(95 %: {low:.3g} to {high:.3g})"
+    ends = f"(95%: {low:.3g} to {high:.3g})"
     if fit.family.kind == "axes":
         return AXES[fit.best][0]
     if fit.family.kind == "lag":

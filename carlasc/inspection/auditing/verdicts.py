@@ -19,7 +19,7 @@ State = Literal["fault", "undetermined", "sound"]
 STATES: tuple[State, ...] = ("fault", "undetermined", "sound")  # worst first
 
 Share = tuple[float, float, float]
-"""A number, and the lower and upper end of its interval of 95 %."""
+"""A number, and the lower and upper end of its interval of 95%."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Verdict:
         check: what was checked, such as "shift x"; docs/commands/audit.md lists all.
         state: "fault"; "sound"; "undetermined" if the drive or the files do not determine it.
         value: the number that was measured; None if nothing could be measured.
-        low: lower end of its interval of 95 %.
+        low: lower end of its interval of 95%.
         high: upper end.
         unit: of the three numbers; "share" for shares of 1.
         text: what was found, in words.

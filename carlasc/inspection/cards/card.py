@@ -68,6 +68,7 @@ def card(
     pictures: bool = True,
     draft: bool = False,
     every: int = 1,
+    sample: int | None = None,
     overwrite: bool = False,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> CardResult:
@@ -86,6 +87,7 @@ def card(
         draft: write the card although licence, personal data, place or citation are not stated, and
             name the gaps in it.
         every: count the classes of every N-th frame.
+        sample: number of sequences whose classes are counted, evenly spaced. None: all.
         overwrite: replace an existing card.
         run: how the counting is spread, with a callback for progress.
 
@@ -107,7 +109,7 @@ def card(
     opened = as_source(source)
     place, folder = place_of(source, None if out is None else Path(out), about.url)
     overwrite = _check_free(folder, overwrite, pictures)
-    facts = gather(opened, about, every, run, draft=draft)
+    facts = gather(opened, about, every, sample, run, draft=draft)
     tables = tables_of(opened) if isinstance(opened, ParquetSource) else []
     shown = list(tables_of_card(facts))
     part = "" if facts.simulated == "all" else f"{facts.simulated} "

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from carlasc.inspection.cards.facts import Facts
 from carlasc.inspection.cards.places import split_of
 from carlasc.inspection.overview import GridOverview
 from carlasc.inspection.texts import say
 
-Row = dict[str, str | int | float | None]
+MOST_ROWS = 60  # of a table in README.md
+
+Row = dict[str, Any]  # text, a number or None
 
 
 class Table(NamedTuple):
@@ -55,6 +57,11 @@ def tables_of_card(facts: Facts) -> Iterator[Table]:
         for path in part.paths
     ]
     sequences.sort(key=lambda row: str(row["path"]))
+    kinds: dict[tuple[object, ...], Row] = {}
+    for row in sequences if len(sequences) > MOST_ROWS else ():
+        shared = {name: row[name] for name in ("split", "source", "license", "classes")}
+        sums = kinds.setdefault((*shared.values(),), {**shared, "sequences": 0, "frames": 0})
+        sums |= {"sequences": sums["sequences"] + 1, "frames": sums["frames"] + row["frames"]}
     grids: list[Row] = [
         {
             "grid": grid.name,
@@ -91,6 +98,7 @@ def tables_of_card(facts: Facts) -> Iterator[Table]:
         for part in facts.parts
     ]
     for name, section, rows in (
+        ("splits", "sequences", [*kinds.values()]),
         ("sequences", "sequences", sequences),
         ("grids", "grids", grids),
         ("reports", "grids", reports),

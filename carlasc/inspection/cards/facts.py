@@ -33,6 +33,8 @@ from carlasc.storage.views import ChosenSequences
 STATEMENTS: dict[str, str] = read_table("card.toml")["statements"]
 """What only the author can state: names of fields in croissant.json, and headings in README.md."""
 
+_MOST_LIMITS = 10  # grids with the largest inferred shares
+
 
 @dataclass(frozen=True)
 class CardDetails:
@@ -197,9 +199,10 @@ class Facts:
             yield say("gaps", places=gaps)
         if self.failures:
             yield say("unreadable", files=len(self.failures))
-        for name, report in self.reports.items():
-            if report.inferred_share:
-                yield say("inferred", share=f"{report.inferred_share:.1%}", grid=name)
+        inferred = {name: one.inferred_share or 0 for name, one in self.reports.items()}
+        for name, share in sorted(inferred.items(), key=lambda row: -row[1])[:_MOST_LIMITS]:
+            if share:
+                yield say("inferred", share=f"{share:.1%}", grid=name)
         for near, far in sorted({(m.min_range_m, m.max_range_m) for m in self.metadata}, key=str):
             limits = {"nearer": near, "farther": far}
             if shown := [f"{how} than {limit:g} m" for how, limit in limits.items() if limit]:
@@ -208,6 +211,9 @@ class Facts:
             yield say("rounded", step=f"{self.lossy_mm:g}")
         if self.every > 1:
             yield say("counted", every=self.every)
+        for one in self.statistics:
+            if of := sum(one.places.values()):
+                yield say("sampled", counted=len(one.sequences), of=of)
 
 
 def _recorded(metadata: Iterable[Metadata]) -> list[Metadata]:
@@ -232,7 +238,15 @@ def _gaps(
         yield "citation"
 
 
-def gather(source: Source, details: CardDetails, every: int, run: Run, *, draft: bool) -> Facts:
+def gather(
+    source: Source,
+    details: CardDetails,
+    every: int,
+    sample: int | None,
+    run: Run,
+    *,
+    draft: bool,
+) -> Facts:
     """Read the facts of a card.
 
     Raises:
@@ -274,6 +288,6 @@ def gather(source: Source, details: CardDetails, every: int, run: Run, *, draft:
     for chosen in tables.values():
         with suppress(MissingDataError):  # several grids without the published one
             one_table = ChosenSequences(source.location, chosen)
-            counted.append(stats(one_table, remap=None, every=every, run=run))
+            counted.append(stats(one_table, remap=None, every=every, sample=sample, run=run))
     lossy_mm = source.lossy_mm if isinstance(source, PackedSource) else None
     return Facts(overview, sequences, parts, tuple(counted), every, reports, gaps, lossy_mm)

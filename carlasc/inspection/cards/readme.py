@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from carlasc.errors import count, printable
-from carlasc.inspection.cards.card_tables import Table
+from carlasc.inspection.cards.card_tables import MOST_ROWS, Table
 from carlasc.inspection.cards.facts import STATEMENTS, CardDetails, Facts
 from carlasc.inspection.cards.places import Place, PublishedTable
 from carlasc.inspection.texts import fill, say
@@ -29,7 +29,6 @@ _TAGS = (
     "croissant carlasc lidar 3d voxel-grid semantic-scene-completion occupancy-prediction "
     "autonomous-driving"
 ).split()
-_MOST_ROWS = 60  # of a table
 
 
 def readme(
@@ -170,10 +169,10 @@ def _opening(facts: Facts, place: Place, tables: Sequence[PublishedTable]) -> st
 def _section(tables: Sequence[Table], name: str) -> str:
     text = []
     for _, _, title, rows in (table for table in tables if table.section == name):
-        shown = [list(row.values()) for row in rows[:_MOST_ROWS]]
+        shown = [list(row.values()) for row in rows[:MOST_ROWS]]
         text += [_text(title), _table([*rows[0]], shown)]
-        if len(rows) > _MOST_ROWS:
-            text.append(say("more_rows", count=len(rows) - _MOST_ROWS))
+        if len(rows) > MOST_ROWS:
+            text.append(say("more_rows", count=len(rows) - MOST_ROWS))
     return "\n\n".join(text) or "None."
 
 

@@ -35,6 +35,8 @@ class PackOptions:
             numcodecs.
         lossy_mm: quantise points to this many millimetres; None is lossless.
         block: number of frames per file of a zarr store. One task writes a block.
+        made_from: digest of the input of a Parquet store. A run that was interrupted with another
+            input starts again.
 
     Raises:
         ArgumentError: `lossy_mm` is not above 0 and at most 1000, or `block` is not from 1 to 1024.
@@ -43,6 +45,7 @@ class PackOptions:
     small: bool = False
     lossy_mm: float | None = None
     block: int = 16
+    made_from: str = ""
 
     def __post_init__(self) -> None:
         check_types(PackOptions, vars(self))

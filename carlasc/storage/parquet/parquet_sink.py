@@ -51,7 +51,7 @@ from carlasc.storage.parquet.table_columns import (
     statistics,
 )
 
-# level of Zstandard: from 11, points take 2 % less space; above 12, it takes several times as long
+# level of Zstandard: from 11, points take 2% less space; above 12, it takes several times as long
 _LEVEL = 12
 _PAGE = 8 << 20  # bytes: one page holds one column of a scan
 
@@ -75,7 +75,8 @@ class ParquetSink(PackedSink):
         import_extra("pyarrow.parquet", "parquet")
         super().__init__(path, options, overwrite)
         mark = self.part / UNFINISHED_MARK
-        run = to_json({"version": VERSION, "lossy_mm": self.options.lossy_mm})
+        given = {"lossy_mm": self.options.lossy_mm, "made_from": self.options.made_from}
+        run = to_json({"version": VERSION, **given})
         if not mark.is_file() or mark.read_bytes() != run:
             remove(self.part)
             write_atomic(mark, run)

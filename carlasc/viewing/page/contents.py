@@ -159,7 +159,7 @@ def pack_arrays(arrays: Mapping[str, AnyArray]) -> bytes:
     for array in arrays.values():
         little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
         parts.append(little.view(np.uint8).reshape(-1, array.dtype.itemsize).T.tobytes())
-    return zlib.compress(b"".join(parts), 5)  # level 6 takes twice as long for 4 % fewer bytes
+    return zlib.compress(b"".join(parts), 5)  # level 6 takes twice as long for 4% fewer bytes
 
 
 def _gaps(rising: AnyIntArray) -> LabelArray:

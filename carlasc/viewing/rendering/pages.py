@@ -220,7 +220,7 @@ def _place_legend(
 def _place_below(
     size: tuple[int, int], font: Any, entries: list[Entry]
 ) -> tuple[list[Entry], list[Box], Box]:
-    """Place entries in centred rows at the bottom, in at most 40 % of the page; the last entry
+    """Place entries in centred rows at the bottom, in at most 40% of the page; the last entry
     counts those left out.
     """
     width, height = size

@@ -133,10 +133,24 @@ def write_store(
     metadata[".zgroup"] = {"zarr_format": 2}
     metadata[".zattrs"] = {
         "sequence_id": sequence,
+        "sequence_timestamp_interval_us": {
+            "start": int(content["stamps"][0]),
+            "stop": int(content["stamps"][-1]) + 1,
+        },
         "version": version,
         "component_group_name": "",
         "generic_meta_data": {},
     }
+
+    def component(name: str) -> None:
+        kind, _, instance = name.partition("/")
+        group(
+            name,
+            component_name=kind,
+            component_instance_name=instance,
+            component_version="v1",
+            generic_meta_data={},
+        )
 
     def array(name: str, values: np.ndarray, chunks: tuple[int, ...]) -> None:
         from numcodecs import Blosc
@@ -153,7 +167,7 @@ def write_store(
             )
 
     for name in content["mounts"]:
-        group(f"lidars/{name}", component_version="v1")
+        component(f"lidars/{name}")
         spans = [
             frame["span"].tolist() for (own, _), frame in content["frames"].items() if own == name
         ]
@@ -167,11 +181,16 @@ def write_store(
         array(f"{rays}/timestamp_us", frame["timestamp_us"], frame["timestamp_us"].shape)
         for key in ("distance_m", "intensity"):
             array(f"{returns}/{key}", frame[key], (1, frame[key].shape[1]))
-    group("poses/default", component_version="v1")
+        group(f"{place}/generic_data")
+        valid = f"{place}/ray_bundle_returns_valid_mask_packed"
+        packed = np.packbits(~np.isnan(frame["distance_m"]))
+        array(valid, packed, packed.shape)
+        metadata[f"{valid}/.zattrs"] = {"n_rays": len(frame["direction"]), "n_returns": 2}
+    component("poses/default")
     cameras = content.get("cameras", {})
     for name, camera in cameras.items():
         group(f"intrinsics/default/cameras/{name}", **camera["lens"])
-        group(f"cameras/{name}", component_version="v1")
+        component(f"cameras/{name}")
         group(
             f"cameras/{name}/frames", frames_timestamps_us=[list(span) for span in camera["images"]]
         )
@@ -182,8 +201,10 @@ def write_store(
             }  # fmt: skip
             metadata[f"{place}/.zattrs"] = {"format": kind}
             members[f"{place}/0"] = data
-    if cameras:
-        metadata["intrinsics/default/.zattrs"] = {"component_version": "v1"}
+    for kind, things in {"intrinsics": ("cameras", "lidars"), "masks": ("cameras",)}.items():
+        component(f"{kind}/default")
+        for thing in things:
+            group(f"{kind}/default/{thing}")
     content["mounts"] |= {
         name: camera["rig_T_camera"] for name, camera in cameras.items() if "rig_T_camera" in camera
     }
@@ -198,7 +219,7 @@ def write_store(
     }
     group("poses/default/static_poses", **static)
     group("poses/default/dynamic_poses", **{str(("rig", "world")): moving})
-    group("cuboids/default", component_version="v1")
+    component("cuboids/default")
     group("cuboids/default/cuboids", cuboid_track_observations=content["observations"])
     path = folder / file
     _write_archive(

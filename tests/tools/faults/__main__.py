@@ -19,7 +19,7 @@ from pathlib import Path
 from measuring.figures import Figures, publish
 
 from faults.commands import COMMANDS
-from faults.figures import KINDS, keep
+from faults.figures import KINDS, keep, read, write
 
 
 def chosen_commands(wanted: list[str]) -> list[str]:
@@ -56,7 +56,14 @@ def main() -> int:
     parser.add_argument(
         "--add", action="store_true", help="add the cases to those of earlier seeds in the figures"
     )
+    parser.add_argument(
+        "--publish", action="store_true", help="only write the pages, with when the code changed"
+    )
     given = parser.parse_args()
+    if given.publish:
+        write(read())
+        publish(Figures.read())
+        return 0
     found = []
     for name in given.only or KINDS:
         kind = KINDS[name]

@@ -1,11 +1,13 @@
-"""Inputs that change between two runs of a command: the second run gives what a run into an empty
-folder gives, or is refused.
+"""Inputs that change between two runs of a command, of which the first may have been killed: the
+second run gives what a run into an empty folder gives, or is refused.
 """
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
+import signal
 import time
 import zlib
 from collections import Counter
@@ -16,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 import carlasc
-from faults.commands import COMMANDS, MESSAGES, Command, run_command, warm
+from faults.commands import COMMANDS, MESSAGES, Command, run_command, start, wait, warm
 from faults.comparing import STORES, Content, arrays_of, content_of, differences
 from faults.outcome import Outcome
 from faults.trying import shares, try_commands
@@ -26,13 +28,23 @@ _TEXTS = (".txt", ".json")
 _FRAME = re.compile(r"(\d+)\.[a-z.]+")
 _OTHER_SETTINGS = "expected a grid with the same settings"  # such as another first frame
 _REPAIRED = 0.3  # share of the changes that are taken back
+_KILLED = 0.3  # share of the first runs that are killed
 _ABOUT = ("simulation.json",)  # what carlasc.json says of a data set stays: users complete it
+_CONTINUING = (
+    "regrid",
+    "convert",
+    "export",
+    "label",
+    "refine",
+    "map",
+    "audit",
+    "pack",
+    "unpack",
+    "report-save",
+)
 _STEPS = 16  # bytes: a point, and a multiple of the size of a label
 REPEATED = tuple(
-    name
-    for name in COMMANDS
-    if name.startswith(("regrid", "convert", "export", "label", "refine", "map", "audit"))
-    and "overwrite" not in name
+    name for name in COMMANDS if name.startswith(_CONTINUING) and "overwrite" not in name
 )
 """The commands that continue or keep what an earlier run wrote."""
 
@@ -58,7 +70,9 @@ def _try_command(
     warm(command, base, work / "warm")
     shutil.rmtree(work / "done", ignore_errors=True)
     command.copy_inputs(base, work / "done")
-    if code := run_command(command, work / "done"):
+    began = time.monotonic()
+    code, seconds = run_command(command, work / "done"), time.monotonic() - began
+    if code:
         raise RuntimeError(f"exit code {code}: {(work / 'done' / MESSAGES).read_text()}")
     inputs = [
         path.relative_to(base).as_posix()
@@ -74,7 +88,12 @@ def _try_command(
         story = f"{command.name}, seed {seed}, case {number}: {change.__name__} {path}"
         number += 1
         shutil.rmtree(work / "case", ignore_errors=True)
-        shutil.copytree(work / "done", work / "case")
+        if rng.random() < _KILLED:
+            moment = rng.random() * seconds
+            story += f", killed at {moment:.3f} s"
+            _kill(command, base, work / "case", moment)
+        else:
+            shutil.copytree(work / "done", work / "case")
         before = content_of(work / "case")
         if not change(work / "case" / path, np.random.default_rng(draw)):
             continue
@@ -108,6 +127,16 @@ def _try_command(
     return tried, found
 
 
+def _kill(command: Command, base: Path, case: Path, moment: float) -> None:
+    """Run a command in a new folder, and kill it with its workers at a moment, in seconds."""
+    command.copy_inputs(base, case)
+    child = start(command.argv, case)
+    time.sleep(moment)
+    with suppress(ProcessLookupError):  # it has finished
+        os.killpg(child, signal.SIGKILL)
+    wait(child, 60)
+
+
 def _repaired(command: Command, work: Path, before: Content, after: Content) -> list[str]:
     """Take a change back and run a command once more; returns what differs from the first run."""
     case = work / "case"
@@ -117,7 +146,8 @@ def _repaired(command: Command, work: Path, before: Content, after: Content) -> 
         elif name not in before:
             (case / name).unlink()
     if code := run_command(command, case):
-        return [] if _may_refuse(command) else [f"exit code {code}: {_last_line(case)}"]
+        may_refuse = _may_refuse(command) or _OTHER_SETTINGS in _last_line(case)
+        return [] if may_refuse else [f"exit code {code}: {_last_line(case)}"]
     return _wrong(command, work / "done", case)
 
 
@@ -125,7 +155,7 @@ def _may_refuse(command: Command, path: str = "") -> bool:
     """Whether a command may refuse to continue: stores and copies that are finished, and poses and
     times of `convert`.
     """
-    if command.name.startswith(("label", "refine", "map")):
+    if command.name.startswith(("label", "refine", "map", "pack", "unpack")):
         return True
     is_convert = command.name.startswith("convert")
     return Path(command.output).suffix in (".h5", ".parquet") or (

@@ -108,6 +108,19 @@ EVERY = (
         ("scene",),
         "scene",
     ),
+    Command(
+        "regrid-kept",
+        f"regrid scene {GRID} --observe scans --name kept --keep-votes --keep-evidence "
+        "--keep-actors",
+        ("scene",),
+        "scene",
+    ),
+    Command(
+        "regrid-grid",
+        "regrid scene --size 8,8,4 --observe grid --from-grid evaluation_16x16x8 --name coarse",
+        ("scene",),
+        "scene",
+    ),
     Command("convert", f"convert kitti kitti out {GRID} --force", ("kitti",), "out"),
     Command(
         "convert-zarr",
@@ -150,6 +163,7 @@ EVERY = (
     ),
     Command("unpack", "unpack scene.zarr out", ("scene.zarr",), "out", _ZARR),
     Command("export-kitti", "export kitti scene out", ("scene",), "out"),
+    Command("export-occ3d", "export occ3d scene out", ("scene",), "out"),
     Command("convert-scans", f"convert scans scans out {GRID} --force", ("scans",), "out"),
     Command(
         "convert-bag", "convert bag bag out --grids none --force", ("bag",), "out", ("rosbags",)
@@ -166,6 +180,10 @@ EVERY = (
     Command("label-images", "label seen -o out --from images", ("seen",), "out", _PICTURES),
     Command("refine", "refine scene -o out --refine always", ("scene",), "out"),
     Command("map", "map scene out.ply", ("scene",), "out.ply"),
+    Command("map-bag", "map bag out.ply --force", ("bag",), "out.ply", ("rosbags",)),
+    Command(
+        "map-grid", "map scene out.ply --grid evaluation_16x16x8 --frames 1", ("scene",), "out.ply"
+    ),
     Command("audit-keep", "audit merged merged --keep out", ("merged",), "out"),
     Command(
         "capture",
@@ -212,6 +230,7 @@ EVERY = (
         ("scene",),
         "out.html",
     ),
+    Command("report-save", "report scene --save", ("scene",), "scene"),
     Command(
         "card",
         "card scene -o out --license cc0-1.0 --published 2026-11-22 --no-pictures --overwrite",

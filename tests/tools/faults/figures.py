@@ -7,6 +7,8 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import json
+import os
+import subprocess
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -107,22 +109,79 @@ KINDS = {
 """Every kind, in the order of the table. A kind that has no module yet is left out of a run."""
 
 
-def keep(outcome: Outcome, date: datetime.date, *, add: bool = False) -> None:
-    """Write an outcome into the figures, in place of the one of its kind, or added to it."""
+def keep(
+    outcome: Outcome, date: datetime.date, code: str | None = None, *, add: bool = False
+) -> None:
+    """Write an outcome into the figures, in place of the one of its kind, or added to it.
+
+    Args:
+        outcome: the outcome.
+        date: when its cases were run.
+        code: when the code that they were run with changed last; None: the code of now.
+        add: whether it is added.
+    """
     rows = read()
     row = dataclasses.asdict(outcome) | {"seconds": round(outcome.seconds)}
+    run = {"date": date.isoformat(), "code": code or code_changed()}
+    runs = Counter({tuple(run.values()): outcome.tried})
     if add and (before := rows.get(outcome.kind)):
         row |= {name: before[name] + row[name] for name in ("tried", "found", "seconds")}
         row["commands"] = dict(Counter(before.get("commands", {})) + Counter(outcome.commands))
-    rows[outcome.kind] = {"date": date.isoformat(), **row}
-    FIGURES.write_text(
-        json.dumps({kind: rows[kind] for kind in KINDS if kind in rows}, indent=2) + "\n"
-    )
+        runs.update({(one["date"], one["code"]): one["tried"] for one in before["runs"]})
+    listed = [dict(zip(run, key, strict=True), tried=tried) for key, tried in sorted(runs.items())]
+    write(rows | {outcome.kind: {"date": run["date"], **row, "runs": listed}})
+
+
+def write(rows: dict[str, dict[str, Any]]) -> None:
+    """Write the figures, with when the code changed last."""
+    kept = {kind: rows[kind] for kind in KINDS if kind in rows}
+    FIGURES.write_text(json.dumps({"code": code_changed(), **kept}, indent=2) + "\n")
+
+
+def code_changed() -> str:
+    """Return when the package or the converters changed last, by the commits: "2026-11-26
+    19:21", in UTC.
+    """
+    code, utc = ("--", "carlasc", "converters"), {**os.environ, "TZ": "UTC"}
+    command = ["git", "log", "-1", "--date=format-local:%Y-%m-%d %H:%M", "--format=%cd", *code]
+    done = subprocess.run(command, cwd=ROOT, env=utc, capture_output=True, text=True, check=True)
+    return done.stdout.strip()
 
 
 def read() -> dict[str, dict[str, Any]]:
     """Return the figures of each kind that was run."""
-    return json.loads(FIGURES.read_text()) if FIGURES.exists() else {}
+    held = json.loads(FIGURES.read_text()) if FIGURES.exists() else {}
+    return {kind: held[kind] for kind in KINDS if kind in held}
+
+
+def known_code() -> str:
+    """Return when the code changed last, as the documentation says."""
+    return str(json.loads(FIGURES.read_text())["code"])
+
+
+def runs(rows: dict[str, dict[str, Any]], code: str) -> str:
+    """Return which cases were run when, and with which code, as a table and a sentence."""
+    lines = ["| kind | cases | run on | code of | changed since |", "|---|---|---|---|---|"]
+    for name, row in rows.items():
+        lines += [
+            f"| {name} | {one['tried']:,} | {one['date']} | {one['code']} | "
+            f"{'no' if one['code'] == code else 'yes'} |"
+            for one in row.get("runs", ())
+        ]
+    return "\n".join([*lines, "", f"The code changed last on {code} (UTC)."])
+
+
+def large(rows: dict[str, dict[str, Any]]) -> str:
+    """Return the table of what large data cost."""
+    lines = [
+        "| command | largest data | CPU time of a quarter, half and all, s | memory, MB |",
+        "|---|---|---|---|",
+    ]
+    for name, size, seconds, kilobytes in rows.get("large", {}).get("measured", ()):
+        cost = ", ".join(f"{one:.3g}" if one < 1000 else f"{one:,.0f}" for one in seconds)
+        memory = ", ".join(f"{one / 1e3:,.0f}" for one in kilobytes)
+        lines.append(f"| `{name}` | {size} | {cost} | {memory} |")
+    return "\n".join(lines)
 
 
 def table(rows: dict[str, dict[str, Any]]) -> str:
@@ -152,15 +211,21 @@ def commands(rows: dict[str, dict[str, Any]]) -> str:
 
 def line(rows: dict[str, dict[str, Any]]) -> str:
     """Return the line of the README."""
-    tried = [f"{row['tried']:,} {KINDS[name].cases}" for name, row in rows.items()]
+    small = {name: row for name, row in rows.items() if name != "large"}
+    tried = [f"{row['tried']:,} {KINDS[name].cases}" for name, row in small.items()]
     listed = " and ".join(filter(None, (", ".join(tried[:-1]), tried[-1])))
     found = sum(len(row["found"]) for row in rows.values())
     result = f"{found} faults found" if found else "no torn file, no lost frame"
     kills = rows.get("kills", {}).get("tried", 0)
-    # None of n independent tries failed: with a confidence of 95 %, fewer than 3 / n of all do.
+    # None of n independent tries failed: with a confidence of 95%, fewer than 3 / n of all do.
     bound = (
-        f" (of kills, at most {3 / kills:.1%} can do harm, with a confidence of 95 %)"
+        f" The share of kills with a fault is below {3 / kills:.1%} with a confidence of 95%."
         if kills and not found
         else ""
     )
-    return f"**Reliability**, tried on small data of two frames: {listed}, {result}{bound}. [Figures and promises](docs/reliability.md)."
+    dates = sorted(row["date"] for row in rows.values())
+    days = " to ".join(dict.fromkeys([dates[0], dates[-1]]))
+    return (
+        f"**Reliability**, tested with data of two frames ({days}): {listed}; {result}.{bound} "
+        "[Figures and promises](docs/reliability.md)."
+    )

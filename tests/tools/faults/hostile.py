@@ -89,16 +89,17 @@ def run(count: int, seed: int, folder: Path) -> Outcome:
     The folders of cases that did harm stay in `folder`.
     """
     from faults.hostile_files import cases as of_files
+    from faults.hostile_formats import cases as of_formats
     from faults.hostile_servers import cases as of_servers
     from faults.hostile_stores import cases as of_stores
     from faults.hostile_weights import cases as of_weights
 
     began = time.monotonic()
-    for command in ("download", "info", "pack", "unpack", "validate", *_OTHERS):
+    for command in ("convert", "download", "info", "pack", "unpack", "validate", *_OTHERS):
         import_module(f"carlasc.cli.{command}")  # once, for all children
     base = folder / "inputs"
     base.mkdir(parents=True)
-    of_data = [*of_files(base), *of_stores(base)]
+    of_data = [*of_files(base), *of_stores(base), *of_formats(base)]
     others = [_met_by_another(case, place) for place, case in enumerate(of_data)]
     table = [*of_data, *of_servers(), *of_weights(), *filter(None, others)]
     if seed:

@@ -18,7 +18,7 @@ import numpy as np
 from carlasc.storage import FolderSink, layout
 from carlasc.storage.files import set_durable
 from faults.commands import MESSAGES, start
-from faults.outcome import Outcome
+from faults.outcome import Measured, Outcome
 
 _WORSE = 1.5  # times the cost of an item in the first doubling; more is a fault
 _NOISE_S, _NOISE_KB = 0.5, 20_000  # of CPU time and of memory, in each difference
@@ -48,14 +48,16 @@ class Large:
     kilobytes: float
 
 
-def write_frames(root: Path, frames: int, points: int = 60, name: str = "Drive") -> None:
-    """Write a sequence of tiny scans along a straight road."""
+def write_frames(
+    root: Path, frames: int, points: int = 60, name: str = "Drive", period_s: float = 0.1
+) -> None:
+    """Write a sequence of tiny scans along a straight road, at 5 m/s."""
     set_durable(False)
     writer = FolderSink(root).sequence(f"Train/{name}/cartesian")
     poses = np.tile(np.eye(4), (frames, 1, 1))
-    poses[:, 0, 3] = 0.5 * np.arange(frames)
+    poses[:, 0, 3] = 5 * period_s * np.arange(frames)
     writer.write_document(layout.POSES, layout.encode_poses(poses))
-    writer.write_document(layout.TIMES, layout.encode_times(0.1 * np.arange(frames)))
+    writer.write_document(layout.TIMES, layout.encode_times(period_s * np.arange(frames)))
     rng = np.random.default_rng(0)
     scan = np.zeros((points, 4), np.float32)
     scan[:, :3] = rng.uniform((-10, -10, -1.9), (10, 10, 1), (points, 3))
@@ -68,6 +70,10 @@ def write_frames(root: Path, frames: int, points: int = 60, name: str = "Drive")
 def _sequences(root: Path, sequences: int) -> None:
     for number in range(sequences):
         write_frames(root, 1, name=f"Drive{number:05d}")
+
+
+def _seconds(root: Path, seconds: int) -> None:
+    write_frames(root, seconds, 200, period_s=1.0)
 
 
 def _points(root: Path, points: int) -> None:
@@ -105,6 +111,18 @@ LARGE = (
         60,
     ),
     Large(
+        "seconds of a drive",
+        _seconds,
+        (
+            "map data out.ply --cell 0.5 --workers 1",
+            "refine data -o out --refine always --workers 1",
+        ),
+        7_200,
+        900,
+        120,
+        12,
+    ),
+    Large(
         "points of a scan",
         _points,
         (f"regrid data {_TINY} --workers 1", "info data"),
@@ -136,14 +154,17 @@ def run(count: int, seed: int, folder: Path) -> Outcome:
         seed: not used: nothing is random.
         folder: an empty folder to work in.
     """
-    began, tried, found = time.monotonic(), 0, list[str]()
+    began, found, measured = time.monotonic(), list[str](), list[Measured]()
     for large in LARGE:
         size = large.full if count >= 1000 else large.quick if count else large.least
         costs = [_costs(large, size * part // _PARTS, folder / large.name) for part in (1, 2, 4)]
         for command, *cost in zip(large.commands, *costs, strict=True):
-            tried += 1
-            found += _judge(f"{command.split()[0]}, {size:,} {large.name}", large, size, *cost)
-    return Outcome("large", tried, found, time.monotonic() - began)
+            name = command.split()[0]
+            found += _judge(f"{name}, {size:,} {large.name}", large, size, *cost)
+            seconds, kilobytes = zip(*cost, strict=True)
+            measured.append((name, f"{size:,} {large.name}", seconds, kilobytes))
+    seconds_in_all = time.monotonic() - began
+    return Outcome("large", len(measured), found, seconds_in_all, measured=measured)
 
 
 Cost = tuple[float, float]

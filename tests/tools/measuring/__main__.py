@@ -41,6 +41,7 @@ GROUPS = {  # name -> module, function, and its first arguments
     "metrics": ("measuring.benchmarks", "measure_file"),
     "simulation": ("measuring.simulating", "measure_simulation"),
     "recordings": ("measuring.recording", "measure_recordings"),
+    "records": ("measuring.records", "measure_records"),
     "networks": ("measuring.networks", "measure_networks"),
 }
 _LONGEST_S = {"tiny": 600, "quick": 900, "full": 7200}  # of one group; what takes longer failed

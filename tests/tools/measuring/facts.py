@@ -58,7 +58,7 @@ CONSTANTS: dict[str, dict[str, str]] = {
         "10 frames per second": "film-rate",
         "0.1 s": "frame-period",
     },
-    "docs/design.md": {"5 %": "room-growth"},
+    "docs/design.md": {"5%": "room-growth"},
     "docs/ground-truth.md": {
         "5 s": "horizon",
         "0.5 s": "smooth-boxes",
@@ -109,7 +109,7 @@ CONSTANTS: dict[str, dict[str, str]] = {
 # (page, number or heading of a section) -> why it is right; at most 20
 EXCEPTIONS: dict[tuple[str, str], str] = {
     ("docs/performance.md", "20 minutes"): "what a run of `make figures` is allowed to take",
-    ("docs/index.md", "0.7 GB"): "the size of a download of torch",
+    ("docs/start.md", "0.7 GB"): "the size of a download of torch",
     (
         "docs/commands/audit.md",
         "0.25",

@@ -12,6 +12,7 @@ from typing import Any
 
 from faults import figures as faults
 
+from measuring import cells
 from measuring.facts import CONSTANTS, EXCEPTIONS, FACTS
 from measuring.places import fill, keys, sections, typed_by_hand
 
@@ -43,7 +44,7 @@ class Figure:
             text = _number(self.value)
         else:
             text = f"{_number(self.value)} to {_number(self.high)}"
-        return f"{text} {self.unit}".strip()
+        return f"{text}%" if self.unit == "%" else f"{text} {self.unit}".strip()
 
 
 def _number(value: float) -> str:
@@ -119,10 +120,12 @@ class Figures:
         other = {
             "faults.table": faults.table(rows),
             "faults.commands": faults.commands(rows),
+            "faults.runs": faults.runs(rows, faults.known_code()),
+            "faults.large": faults.large(rows),
             "faults.line": faults.line(rows),
             "figures.machine": self._machine(),
         }
-        return {key: str(figure) for key, figure in self.figures.items()} | other
+        return {key: str(figure) for key, figure in self.figures.items()} | other | cells.texts()
 
     def _machine(self) -> str:
         """Return a sentence for each run: processor, load, versions and date."""
