@@ -73,7 +73,7 @@ class Case:
 
     grid: str = "0.4 m"
     channels: int = 64
-    row: Row = BY_NAME["align, evidence"]
+    row: Row = BY_NAME["align, free space"]
 
 
 CASES = {
@@ -86,9 +86,9 @@ CASES = {
     "0.8 m": Case("0.8 m"),
     "0.1 m": Case("0.1 m"),
     "cylindrical": Case("cylindrical"),
-    "poses 5 cm off": Case(row=BY_NAME["evidence, poses 5 cm"]),
-    "poses 20 cm off": Case(row=BY_NAME["evidence, poses 20 cm"]),
-    "poses 0.5 degrees off": Case(row=BY_NAME["evidence, poses 0.5 degrees"]),
+    "poses 5 cm off": Case(row=BY_NAME["free space, poses 5 cm"]),
+    "poses 20 cm off": Case(row=BY_NAME["free space, poses 20 cm"]),
+    "poses 0.5 degrees off": Case(row=BY_NAME["free space, poses 0.5 degrees"]),
     "20 % wrong labels, in clumps": Case(row=Row("clumps", EVIDENCE, WrongLabels(0.2, 1.0))),
     "40 % wrong labels": Case(row=Row("wrong", EVIDENCE, WrongLabels(0.4, None))),
     "flow": Case(row=BY_NAME["align, flow"]),

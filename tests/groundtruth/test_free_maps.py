@@ -162,9 +162,10 @@ def test_memory_does_not_grow_along_a_drive():
     assert not found._blocks.counts.any()
 
 
-def test_a_cylindrical_grid_has_no_gaps_near_its_axis():
+@pytest.mark.parametrize("fine", [False, True])
+def test_a_cylindrical_grid_has_no_gaps_near_its_axis(fine):
     spec = GridSpec("cylindrical", (20, 90, 8), (0.0, -np.pi, -1.6), (8.0, np.pi, 1.6))
-    found = FreeMap(spec, STEP_M)
+    found = FreeMap(spec, STEP_M, fine=fine)
     rays = cast(0, 60_000)
     found.hold([0], lambda scan: rays)
     counts = found.count(np.eye(4)).reshape(spec.size)
@@ -172,4 +173,5 @@ def test_a_cylindrical_grid_has_no_gaps_near_its_axis():
     assert counts.sum() == pytest.approx(expected.sum(), rel=0.1)
     ring = slice(3, 15)
     assert (counts[ring] > 0).mean() > 0.99
-    assert np.corrcoef(counts[ring].ravel(), expected[ring].ravel())[0, 1] > 0.8
+    alike = np.corrcoef(counts[ring].ravel(), expected[ring].ravel())[0, 1]
+    assert alike > (0.9 if fine else 0.8)  # small cells are more exact

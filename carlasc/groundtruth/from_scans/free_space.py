@@ -424,9 +424,9 @@ def _gather(
         ):
             height += 1
         if cells.cylindrical and along > 1:
-            # about one place in the width of each cell, as in x, but not more than 16
+            # about one place in the width of each cell, as in x, but not too many
             wide = (cells.lower[0] + (i + 0.5) * voxel_size[0]) * voxel_size[1]
-            many = int(min(max(math.ceil(2 * wide / voxel_size[0]), 1.0), 16.0))
+            many = int(min(max(math.ceil(along * wide / voxel_size[0]), 1.0), 8.0 * along))
             weight = wide * voxel_size[0] * voxel_size[2] / (across * many * up * volume)
         column = columns[: height * up]
         column[:] = 0
