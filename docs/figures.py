@@ -217,7 +217,7 @@ def draw_logo() -> bytes:
 
 
 FIGURES: dict[str, Callable[[], bytes]] = {
-    "logo.svg": draw_logo,
+    "../assets/logo.svg": draw_logo,
     "steps.svg": draw_steps,
     "frames.svg": draw_frames,
     "votes.svg": draw_votes,

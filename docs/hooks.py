@@ -67,6 +67,9 @@ def on_config(config: Any) -> Any:
     config.copyright = f"carlasc {carlasc.__version__}, MIT licence"
     if _REPOSITORY:
         config.repo_url, config.repo_name = _REPOSITORY, _REPOSITORY.partition("://")[2]
+        host, owner, name = config.repo_name.split("/")
+        if host == "github.com":  # where its pages are: links of 404.html begin there
+            config.site_url = f"https://{owner}.github.io/{name}/"
     config.nav = _expand(config.nav, Path(config.docs_dir), set(_pages(config.nav)))
     return config
 

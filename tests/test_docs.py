@@ -14,6 +14,7 @@ from functools import cache
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -364,6 +365,20 @@ def hooks():
     return hooks
 
 
+def test_the_site_names_the_repository_once_it_has_an_address(hooks, monkeypatch):
+    page = SimpleNamespace(meta={}, file=SimpleNamespace(src_uri="howto/page.md"))
+    text = "      - uses: ./carlasc\n"
+    monkeypatch.setattr(hooks, "_REPOSITORY", "")
+    config = hooks.on_config(SimpleNamespace(nav=[], docs_dir=str(DOCS)))
+    assert not hasattr(config, "repo_url") and carlasc.__version__ in config.copyright
+    assert hooks.on_page_markdown(text, page) == text
+    monkeypatch.setattr(hooks, "_REPOSITORY", "https://github.com/org/carlasc")
+    config = hooks.on_config(config)
+    assert config.repo_url == "https://github.com/org/carlasc"
+    assert config.site_url == "https://org.github.io/carlasc/"
+    assert f"uses: org/carlasc@v{carlasc.__version__}" in hooks.on_page_markdown(text, page)
+
+
 def test_every_command_has_a_page_and_every_page_a_command(hooks):
     pages = {
         page.removeprefix("commands/").removesuffix(".md")
@@ -426,7 +441,11 @@ def figures():
     return figures
 
 
-@pytest.mark.parametrize("name", ["frames.svg", "votes.svg"])
+@pytest.mark.parametrize(
+    "name",
+    ["frames.svg", "votes.svg", "steps.svg", "../assets/logo.svg"],
+    ids=lambda name: name[-9:],
+)
 def test_drawings_are_those_that_the_script_draws(name, figures):
     if (
         f"matplotlib=={version('matplotlib')}"

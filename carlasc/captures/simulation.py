@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -115,6 +115,15 @@ class Simulator(Capture, ABC):
         Raises:
             DependencyError: a package is missing.
         """
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the data of each frame depend on, as JSON values."""
+        return {
+            **{"seed": self.seed, "traffic": self.traffic, "sensors": self._sensors},
+            **{"bev": self.bev, "lidar": dataclasses.asdict(self.lidar), "recipe": self.recipe},
+            **({"cameras": list(self.cameras)} if self.cameras else {}),
+        }
 
     @cached_property
     def sensors(self) -> tuple[int, ...]:
@@ -248,13 +257,7 @@ def simulate(
         cameras=cameras,
     )
     check_shared(os.fspath(out), run)
-    settings = {
-        **{"seed": seed, "traffic": traffic, "sensors": sensors, "bev": bev},
-        "lidar": dataclasses.asdict(drive.lidar),
-        "recipe": drive.recipe,
-        **({"cameras": list(cameras)} if cameras else {}),
-        **({"simulator": simulator} if simulator != TOWN else {}),
-    }
+    settings = drive.settings | ({"simulator": simulator} if simulator != TOWN else {})
     drive.check_packages()
     writer = CaptureWriter(out)
     writer.check_settings(SETTINGS_FILE, settings, "carlasc simulate")

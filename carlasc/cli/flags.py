@@ -191,15 +191,13 @@ class WorkFlags(Flags):
             usual: number of processes without --workers; None for one per core.
             shown: whether there is a progress bar.
         """
-        from carlasc.running.spreading import Run
+        from carlasc.running.spreading import Part, Run
 
-        part = self._part()
+        own = vars(self)  # of `PartFlags` and `RunFlags`
+        part, listed = Part.parse(own.get("part") or "1/1"), own.get("sequences_from")
         bar = progress_bar(title, unit) if shown else nullcontext()
         with bar as progress, self._engine() as executor:
-            yield Run(self.workers or usual, executor, progress=progress, **part)
-
-    def _part(self) -> dict[str, Any]:
-        return {}
+            yield Run(self.workers or usual, executor, part, listed, progress)
 
     @contextmanager
     def _engine(self) -> Iterator[Engine | None]:
@@ -225,11 +223,6 @@ class PartFlags(WorkFlags):
         ),
     ] = None
 
-    def _part(self) -> dict[str, Any]:
-        from carlasc.running.spreading import Part
-
-        return {} if self.part is None else {"part": Part.parse(self.part)}
-
 
 @dataclass(frozen=True)
 class RunFlags(PartFlags):
@@ -243,10 +236,6 @@ class RunFlags(PartFlags):
             "If it does not exist, it is written, so that other parts need not list SOURCE.",
         ),
     ] = None
-
-    def _part(self) -> dict[str, Any]:
-        listed = self.sequences_from
-        return super()._part() | ({} if listed is None else {"sequences_from": listed})
 
 
 @dataclass(frozen=True)

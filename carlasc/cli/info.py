@@ -52,10 +52,9 @@ def _print(overview: Overview, *, everything: bool) -> None:
     if overview.places:
         frames, taken = overview.total("frames"), overview.total("bytes")
         show(f"{count(sum(overview.places.values()), 'sequence')}{splits}")
-        show(
-            f"{len(overview.sequences)} looked at (--all: all): in all "
-            f"{frames.text(lambda number: f'{number:,.0f}')} frames, {taken.text(_size)}"
-        )
+        size = f"{_size(taken.value)} ({_size(taken.low)} to {_size(taken.high)})"
+        looked_at = f"{len(overview.sequences)} looked at (--all: all)"
+        show(f"{looked_at}: in all {frames:,.0f} frames, {size}")
         header = "Split|Fields|Axes|Classes|Sensor|Sequences|Frames"
         print_table(header.split("|"), _rows_of_kinds(overview))
     elif overview.sequences:

@@ -73,8 +73,8 @@ def _print(result: ReportResult, *, everything: bool) -> None:
     if result.places or (len(result.reports) > MANY and not everything):
         title = ""
         if result.places:
-            known = result.known().text(lambda share: f"{100 * share:.1f}")
-            title = f"a sample of {sum(result.places.values()):,} sequences: known % {known}"
+            number = sum(result.places.values())
+            title = f"a sample of {number:,} sequences, known: {result.known():.1%}"
         splits = result.by_split()
         sums = [[split, *values.values()] for split, values in splits.items()]
         print_table(["sums of", *next(iter(splits.values()))], sums, title=title)

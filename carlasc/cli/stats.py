@@ -134,7 +134,7 @@ def _class_table(
                 for counts, intervals in zip(totals, whole, strict=True)
                 for cell in (
                     f"{counts[name]:,}",
-                    intervals[name].text(_write_percent) if intervals else _percent(counts, name),
+                    f"{intervals[name]:.2%}" if intervals else _percent(counts, name),
                 )
             ]
             weight = [f"{weights[name]:.4f}"] if weights else []
@@ -163,10 +163,6 @@ def _sequence_table(
 
 def _counts(result: Statistics, histogram: Histogram, kind: Kind, remapped: bool) -> dict[str, int]:
     return result.summed(histogram.of(kind)) if remapped else result.named(histogram.of(kind))
-
-
-def _write_percent(share: float) -> str:
-    return f"{100 * share:.2f}"
 
 
 def _percent(counts: dict[str, int], name: str) -> float | None:

@@ -139,7 +139,7 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
     from carlasc.inspection.findings import SEVERITIES, STATES
 
     for (severity, check), findings in result.grouped().items():
-        about = f", in {result.sequences_with(findings).text(_whole)} sequences"
+        about = f", in {result.sequences_with(findings):,.0f} sequences"
         text = f"{severity}: {check} ({len(findings)}{about if result.places else ''})"
         show(text, _COLORS[severity])
         shown = findings if everything else findings[:_SHOWN]
@@ -182,10 +182,6 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
                 show(f"  {words}: {', '.join(own)}")
     counts = ", ".join(count(result.count(severity), severity) for severity in SEVERITIES)
     show(f"{result.location}: {result.verdict} ({counts})", "bold")
-
-
-def _whole(number: float) -> str:
-    return f"{number:,.0f}"
 
 
 def print_held_out(result: HoldoutResult) -> None:

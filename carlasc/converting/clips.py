@@ -34,8 +34,8 @@ from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Part, Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.files import AnyPath, to_json, writing
-from carlasc.storage.folder import FolderSink
-from carlasc.storage.inputs import combined
+from carlasc.storage.folder import FolderSink, FolderWriter
+from carlasc.storage.inputs import combined, folder_states
 from carlasc.storage.opening import PACKED
 from carlasc.storage.shares import read_list
 from carlasc.storage.transport.remote_tree import RemoteTree, tree_of
@@ -75,38 +75,64 @@ class Clips:
             StorageError: the output or the scratch cannot be written.
         """
         sink = FolderSink(self.out)
-        todo = [name for name in self.names if sink.target.read(self._done(name)) is None]
+        todo = dict[str, str]()
+        for name in self.names:
+            done, state = sink.target.read(self._done(name)), self._state(name)
+            if done is None or state.encode() not in done:
+                todo[name] = state
         for name, place in self._fetched(todo):
             if isinstance(place, CarlascError):
                 yield Failure(name, -1, str(place))
                 continue
             try:
-                result = self._convert(name, place, sink, run)
+                result = self._convert(name, todo[name], place, sink, run)
             except StorageError:
                 raise
             except (CarlascError, OSError) as error:
                 yield Failure(name, -1, str(error).replace(str(place), without_credentials(name)))
                 continue
             if not result.failures:
-                sink.target.put(self._done(name), to_json({"clip": without_credentials(name)}))
+                about = {"clip": without_credentials(name), "state": todo[name]}
+                sink.target.put(self._done(name), to_json(about))
             yield result
 
     def _done(self, name: str) -> str:
         """Return the file that says that a clip is done with these arguments."""
         return f"{layout.DERIVED}/clips/{combined(name, repr(self.arguments))}.json"
 
-    def _convert(self, name: str, place: Path, sink: FolderSink, run: Run) -> Any:
+    def _state(self, name: str) -> str:
+        """Return the state of the files of a clip; empty if they are not there any more."""
+        url = self._place(name)
+        states = {} if is_url(url) else folder_states({"": Path(url)})
+        with suppress(CarlascError):
+            if is_url(url):
+                tree = RemoteTree(url)
+                if sizes := tree.sizes():  # a server may have no versions
+                    states = tree.states([*sizes]) | {"sizes": str(sizes)}
+        return combined(sorted(states.items())) if states else ""
+
+    def _convert(self, name: str, state: str, place: Path, sink: FolderSink, run: Run) -> Any:
         given, record = {**self.arguments}, layout.record_file("clip")
-        name = without_credentials(name)
+        name, writers, changed = without_credentials(name), list[FolderWriter](), False
+        mine = f"{name}\n{state}".encode()
         for one in find_recordings(open_converter(given["name"], place, given["options"])):
-            writer = sink.sequence(sequence_path(one))
-            if not writer.create_document(record, name.encode()):
-                before = (writer.read_document(record) or b"").decode()
-                if before != name:
-                    raise ConflictError(writer.location, expected=f"only {name}", found=before)
+            writers.append(writer := sink.sequence(sequence_path(one)))
+            if not writer.create_document(record, mine):
+                before = writer.read_document(record) or b""
+                if (other := before.decode().partition("\n")[0]) != name:
+                    raise ConflictError(writer.location, expected=f"only {name}", found=other)
+                changed |= before != mine
         if place.is_relative_to(self.scratch):  # the times of its files mean nothing
-            given["layout"] = replace(given["layout"], compare_inputs="never")
-        return self.convert(source=place, out=self.out, run=run, **given)
+            compare = "content" if changed else "never"
+            given["layout"] = replace(given["layout"], compare_inputs=compare)
+        result = self.convert(source=place, out=self.out, run=run, **given)
+        for writer in () if result.failures else writers:
+            writer.write_document(record, mine)
+        return result
+
+    def _place(self, name: str) -> str:
+        alone = is_url(name) or Path(name).is_absolute()
+        return name if alone else f"{self.source.rstrip('/')}/{name}"
 
     def _fetched(self, names: Iterable[str]) -> Iterator[tuple[str, Path | CarlascError]]:
         """Yield the place of each clip on this machine, or why it cannot be fetched, while the next
@@ -124,9 +150,7 @@ class Clips:
 
     def _fetch(self, name: str) -> tuple[Path | CarlascError, FileLock | None]:
         """Return the place of a clip, which is fetched if it is at a URL, and the lock of it."""
-        alone = is_url(name) or Path(name).is_absolute()
-        url = name if alone else f"{self.source.rstrip('/')}/{name}"
-        if not is_url(url):
+        if not is_url(url := self._place(name)):
             return Path(url), None
         held = None
         try:

@@ -7,7 +7,7 @@ import json
 import os
 import time
 from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -406,6 +406,8 @@ class _ExportedFrom:
                 path = inside / file
                 if path.is_file() and path.parent.resolve().is_relative_to(inside):
                     path.unlink()
+                    with suppress(OSError):  # it is not empty
+                        path.parent.rmdir()
 
     def write(self) -> None:
         """Write the record."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from carlasc.captures.raw import Capture, CaptureFiles, SensorRecording, find_captures
+from carlasc.captures.simulation import Simulator
 from carlasc.core.arrays import AnyArray, FloatArray
 from carlasc.core.geometry import relative_to
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
@@ -116,6 +117,23 @@ class CaptureFrame(FrameInput):
         return turns
 
 
+@dataclass
+class _SettingsFiles(FrameFiles):
+    """The settings of a simulation, in the place of the files of its frames."""
+
+    settings: bytes
+    kind: str = "simulation"
+    tree: None = None
+
+    def paths(self, frame: int) -> list[str]:
+        """Return none."""
+        return []
+
+    def contents(self, frame: int) -> Iterator[tuple[str, bytes]]:
+        """Yield the settings."""
+        yield "settings", self.settings
+
+
 class CaptureSequence(SequenceInput):
     """A capture as a sequence: its frames are renumbered from 0."""
 
@@ -181,8 +199,12 @@ class CaptureSequence(SequenceInput):
         return cameras_to_json(self.capture.cameras.values()) if self.capture.cameras else None
 
     def files(self) -> FrameFiles | None:
-        """Return the files of the recordings; None if they are on no disk."""
+        """Return the files of the recordings, or the settings of a simulation; None if neither is
+        known.
+        """
         capture = self.capture
+        if isinstance(capture, Simulator):
+            return _SettingsFiles(repr(capture.settings).encode())
         return CaptureFiles(capture.light()) if type(capture) is Capture else None
 
     def depended(self) -> list[int]:

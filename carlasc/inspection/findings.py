@@ -7,8 +7,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-
 from carlasc.errors import CarlascError
 from carlasc.storage.layout import identity_of
 
@@ -159,9 +157,7 @@ class ValidationResult:
         from carlasc.metrics.results import estimate  # compiles loops, for scores
 
         found = {finding.sequence for finding in findings}
-        values = np.array([report.path in found for report in self.sequences])
-        number = sum(self.places.values()) or len(values)
-        return estimate(values, np.full(len(values), 1 / number), number)
+        return estimate([report.path in found for report in self.sequences], self.places)
 
     def by_split(self) -> dict[str, dict[str, int]]:
         """Return the number of sequences and of frames of each split, and of its sequences with

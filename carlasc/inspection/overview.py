@@ -150,9 +150,7 @@ class Overview:
         """
         from carlasc.metrics.results import estimate  # compiles loops, for scores
 
-        values = np.array([getattr(one, name) or 0 for one in self.sequences])
-        number = sum(self.places.values()) or len(values)
-        return estimate(values, np.full(len(values), 1 / number), number)
+        return estimate([getattr(one, name) or 0 for one in self.sequences], self.places)
 
     @property
     def splits(self) -> dict[str, int]:

@@ -9,8 +9,6 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from carlasc.core.frames import FrameRange
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, MissingDataError, check_types
 from carlasc.groundtruth import FrameFailure, FromScans, Voting
@@ -62,8 +60,7 @@ class ReportResult:
         from carlasc.metrics.results import estimate  # compiles loops, for scores
 
         seen = [report.coverage for report in self.reports.values()]
-        known, voxels = np.array([(one.known, one.voxels) for one in seen]).T
-        return estimate(known, voxels, sum(self.places.values()) or len(seen))
+        return estimate([one.known for one in seen], self.places, [one.voxels for one in seen])
 
     def by_split(self) -> dict[str, dict[str, int]]:
         """Return sums of the grids of each name in each split, such as "Train/evaluation"."""

@@ -147,11 +147,8 @@ class Statistics:
 
         names = self.summed if remapped else self.named
         rows = [names(histogram.of(kind)) for histogram in self.sequences.values()]
-        sizes, number = np.array([sum(row.values()) for row in rows]), sum(self.places.values())
-        return {
-            name: estimate(np.array([row[name] for row in rows]), sizes, number or len(rows))
-            for name in rows[0]
-        }
+        sizes = [sum(row.values()) for row in rows]
+        return {name: estimate([row[name] for row in rows], self.places, sizes) for name in rows[0]}
 
     def weights(self) -> dict[str, float]:
         """Return the loss weight of each class, remapped if there is a remap, from the known voxels

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from carlasc.core.arrays import AnyArray, IntArray
+from carlasc.core.arrays import IntArray
 from carlasc.core.classes import ClassTable, TableUse
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics.actor_scores import ActorScore
@@ -383,9 +383,9 @@ class Interval:
     low: float
     high: float
 
-    def text(self, write: Callable[[float], str]) -> str:
-        """Return "value (low to high)", each written by a function."""
-        return f"{write(self.value)} ({write(self.low)} to {write(self.high)})"
+    def __format__(self, spec: str) -> str:
+        """Return "value (low to high)", each in a format of numbers."""
+        return "{:{spec}} ({:{spec}} to {:{spec}})".format(*vars(self).values(), spec=spec)
 
 
 @dataclass(frozen=True)
@@ -434,14 +434,18 @@ def interval_of(value: float, *parts: tuple[float, float]) -> Interval:
     return Interval(value, value - bound, value + bound)
 
 
-def estimate(values: AnyArray, sizes: AnyArray, number: int) -> Interval:
-    """Return the ratio of two sums over sequences, of which a sample is known.
+def estimate(
+    summed: Sequence[float], places: Mapping[str, int], of: Sequence[float] = ()
+) -> Interval:
+    """Return a sum over all sequences, or the ratio of two, estimated from a sample of them.
 
     Args:
-        values: (N,) what is summed, of each sequence of the sample.
-        sizes: (N,) what the sum is divided by.
-        number: number of all sequences.
+        summed: what is summed, of each sequence of the sample.
+        places: numbers of all sequences by split; empty if the sample has all.
+        of: what the sum is divided by; empty for the sum itself.
     """
+    number = sum(places.values()) or len(summed)
+    values, sizes = np.array(summed), np.array(of or [1 / number] * len(summed))
     ratio, degrees = values.sum() / (sizes.sum() or math.nan), len(values) - 1
     if not degrees:
         return Interval(ratio, math.nan, math.nan)

@@ -116,7 +116,7 @@ def record_of(part: Part) -> str:
     """Return the text file by which a part knows the input that it copies: each part may read a
     copy of the input on a machine of its own.
     """
-    return layout.record_file(f"copied-{part.number}-of-{part.count}")
+    return f"{layout.COPIED}{part.number}-of-{part.count}.json"
 
 
 def copy_documents(
@@ -244,7 +244,8 @@ def unpack(
         What was written.
 
     Raises:
-        ConflictError: something exists at `out`, or `out` lies inside `source`.
+        ConflictError: something exists at `out`, `out` lies inside `source`, or `source` changed
+            since an earlier run.
         FormatError, MissingDataError: a part of the source is damaged or missing.
         StorageError: the files cannot be written: a full disk, a folder without write permission.
     """
@@ -265,9 +266,9 @@ def unpack(
     share, sink = Share(source, run), FolderSink(result.out if final is None else unfinished(final))
     write_files(share.sequences(), sink, result, share.run, run.part, again=overwrite)
     if final is not None:
-        for path in result.sequences:
-            sink.sequence(path).remove_document(record_of(run.part))
         put_in_place(unfinished(final), final, overwrite=False)
+        for path in result.sequences:
+            FolderSink(final).sequence(path).remove_document(record_of(run.part))
     result.elapsed_s = time.perf_counter() - began
     return result
 

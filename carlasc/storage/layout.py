@@ -219,6 +219,10 @@ def record_file(name: str) -> str:
     return f"{DERIVED}/{name}.json"
 
 
+COPIED = record_file("copied-").removesuffix(".json")
+"""Beginning of the records of what a copy was made from; they are not listed in a store."""
+
+
 def report_file(grid: str) -> str:
     """Return the path of a grid's carlasc-report.json under `<coordinates>/`."""
     return f"{grid}/{REPORT}"

@@ -113,7 +113,8 @@ def pack(
     Raises:
         ArgumentError: `out` has another suffix, or an option is not supported by this kind of
             store.
-        ConflictError: something exists at `out`, or `out` lies inside `source`.
+        ConflictError: something exists at `out`, `out` lies inside `source`, or `source` changed
+            since an interrupted run.
         DependencyError: the package for this kind of store is not installed.
         FormatError, MissingDataError: a file of the source is damaged or missing.
         StorageError: the store cannot be written: a full disk, a folder without write permission.
@@ -191,9 +192,9 @@ def _pack_blocks(share: Share, sequences: Mapping[str, Sequence], sink: ZarrSink
             sink.sequence(path).is_complete() for path in paths
         ):
             return False  # another part finishes the store
+    sink.finish()
     for writer in writers if run.part.count == 1 else ():
         writer.remove_document(record_of(run.part))
-    sink.finish()
     return True
 
 

@@ -37,7 +37,7 @@ COLORS = {
     "Pole": (90, 90, 90), "TrafficSign": (90, 90, 90), "TrafficLight": (90, 90, 90),
     "Static": (150, 140, 130),
 }  # fmt: skip
-QUIET = replace(CARLA, colors=CARLA.colors | {CARLA.id_of(n): c for n, c in COLORS.items()})
+QUIET = replace(CARLA, colors={**CARLA.colors, **{CARLA.id_of(n): c for n, c in COLORS.items()}})
 SHORT = ("Vehicle", "Pedestrian", "Road", "Sidewalk", "Building", "Terrain")  # of the legend
 
 
@@ -69,6 +69,7 @@ def main() -> None:
             viewpoint=Viewpoint.parse("elevation=44 distance=53 target=0,0,-1.8"),
             legend=colors.entries([CARLA.id_of(name) for name in SHORT]),
             captioned=True,
+            font_size=24,
         )
         out = (
             given.work if study.is_tiny() else Path(__file__).parents[1] / "images"

@@ -22,6 +22,7 @@ from helpers.servers.object_store import BUCKET, client_of, environment_for, s3_
 
 from carlasc import Run
 from carlasc.converting import LayoutOptions, convert
+from carlasc.converting.stages import Conversion
 from carlasc.errors import ArgumentError
 from carlasc.running import Part, open_cluster
 from carlasc.storage.inputs import combined
@@ -99,6 +100,44 @@ def test_a_sequence_of_two_clips_is_a_conflict_and_what_does_not_fit_is_refused(
     with pytest.raises(ArgumentError) as error:
         convert("ncore", tmp_path, tmp_path / "out.zarr", grids=None, run=run)
     assert error.value.where == "out"
+
+
+def interrupt(*arguments: object) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_served", [False, True])
+@pytest.mark.parametrize("is_killed", [False, True])
+def test_a_clip_that_changed_is_converted_again(tmp_path, is_served, is_killed, monkeypatch):
+    files, out = write_clips(tmp_path / "in", 2), tmp_path / "out"
+    path = listed(tmp_path, *files)
+    site = Site(dict(files))
+    with serve(site):
+        source = site.url if is_served else tmp_path / "in"
+
+        def run(target: Path):
+            one = Run(1, sequences_from=path)
+            return convert("ncore", source, target, grids=None, run=one)
+
+        run(out)
+        assert not run(out).sequences
+        name = min(files)
+        other = SimulatedDrive(2, channels=6, columns=48)
+        write_store(tmp_path / "in", other, sequence=Path(name).name.partition(".")[0])
+        site.files[name] = (tmp_path / "in" / name[1:]).read_bytes()
+        if is_killed:
+            with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
+                killed.setattr(Conversion, "_finish", interrupt)
+                run(out)
+        assert len(run(out).sequences) == 1
+        (tmp_path / "in" / name[1:]).unlink()
+        del site.files[name]
+        assert not run(out).failures  # what is done may be deleted at its source
+        write_store(tmp_path / "in", other, sequence=Path(name).name.partition(".")[0])
+        site.files[name] = (tmp_path / "in" / name[1:]).read_bytes()
+        run(tmp_path / "fresh")
+    assert scans(out) == scans(tmp_path / "fresh")
 
 
 @pytest.mark.slow

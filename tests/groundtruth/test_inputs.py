@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from carlasc_recorders import SimulatedCapture
 from helpers.datasets.captures import write_capture
 from helpers.datasets.tiny_kitti import write_tiny_kitti
 from helpers.errors import raises
@@ -15,10 +16,11 @@ from helpers.scenes.passing_car import write_sequence
 
 import carlasc
 from carlasc import FromGrid, FromScans, GridSpec, Run, Voting, regrid
+from carlasc.captures import Lidar
 from carlasc.converting import convert, export
 from carlasc.converting.stages import Conversion
 from carlasc.core import CameraModel
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, ConflictError
 from carlasc.groundtruth.inputs import InputCheck
 from carlasc.motion import PoseOptions
 from carlasc.running import Part, open_cluster
@@ -551,6 +553,26 @@ def test_scans_in_an_object_store(drive, tmp_path, monkeypatch):
         regrid(source, SPEC, tmp_path / "fresh", observe=STILL, run=ALONE)
         carlasc.unpack(f"s3://{BUCKET}/out", tmp_path / "unpacked", run=ALONE)
         assert outputs(out) == outputs(tmp_path / "fresh") == outputs(tmp_path / "unpacked")
+        copied = f"s3://{BUCKET}/copied"
+        carlasc.unpack(source, copied, run=ALONE)
+        assert not carlasc.unpack(source, copied, run=ALONE).files
+        change_points(source, np.random.default_rng(2))
+        with raises(ConflictError, found="files that changed"):
+            carlasc.unpack(source, copied, run=ALONE)
+
+
+@pytest.mark.slow
+def test_a_simulation_with_other_settings(tmp_path):
+    pytest.importorskip("embreex")
+    for points in (800, 1600):
+        town = SimulatedCapture(
+            count=2, sensors=1, lidar=Lidar(channels=8, points=points), bev=False
+        )
+        made = regrid(town, SPEC, tmp_path / "out", run=ALONE)
+        assert made.made == 2
+        assert regrid(town, SPEC, tmp_path / "out", run=ALONE).made == 0
+    regrid(town, SPEC, tmp_path / "fresh", run=ALONE)
+    assert outputs(tmp_path / "out") == outputs(tmp_path / "fresh")
 
 
 @pytest.mark.slow

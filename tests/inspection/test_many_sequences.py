@@ -50,10 +50,10 @@ def test_an_interval_of_a_sample_holds_the_share_of_all():
     values = rng.binomial(sizes, rng.beta(2, 5, 5_000))
     for _ in range(400):
         some = rng.choice(5_000, 100, replace=False)
-        found = estimate(values[some], sizes[some], 5_000)
+        found = estimate([*values[some]], {"Train": 5_000}, [*sizes[some]])
         hits += found.low <= values.sum() / sizes.sum() <= found.high
     assert 0.92 <= hits / 400 <= 0.98
-    whole = estimate(values, sizes, 5_000)
+    whole = estimate([*values], {}, [*sizes])
     assert whole.low == whole.value == whole.high == values.sum() / sizes.sum()
 
 

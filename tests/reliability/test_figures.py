@@ -36,5 +36,5 @@ def test_cases_are_listed_by_their_code() -> None:
 
 def test_faults_that_were_found_are_counted_in_the_table_and_in_the_line() -> None:
     rows = {"kills": {"tried": 1234, "found": ["one", "two"], "seconds": 5, "date": "2026-11-22"}}
-    assert "1,234 kills, 2 faults found" in figures.line(rows)
+    assert "1,234 kills; 2 faults found" in figures.line(rows)
     assert "| 1,234 | 2 | 1 | 2026-11-22 |" in figures.table(rows)

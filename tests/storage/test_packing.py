@@ -29,6 +29,7 @@ from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatErr
 from carlasc.running import Part
 from carlasc.storage import FolderSink, FolderSource, pack, unpack
 from carlasc.storage.packed.stores import PackOptions
+from carlasc.storage.zarr.zarr_sink import ZarrSink
 
 for package in ("zarr", "h5py", "hdf5plugin", "pyarrow"):
     pytest.importorskip(package)
@@ -434,6 +435,27 @@ def test_a_source_that_changes_after_a_kill_is_not_mixed_with_the_old_one(
     if kind != "files":
         unpack(out, tmp_path / "files")
     assert files_of(out if kind == "files" else tmp_path / "files") == files_of(source)
+
+
+def test_a_store_knows_its_source_until_it_is_finished(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    source, out = shutil.copytree(data, tmp_path / "data"), tmp_path / "x.zarr"
+    with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
+        killed.setattr(ZarrSink, "finish", interrupt)
+        pack(source, out, run=Run(1))
+    path = min((source / PATH / "velodyne").iterdir())
+    before = path.stat()
+    os.utime(path, ns=(0, 0))
+    with raises(ConflictError, found="files that changed"):
+        pack(source, out, run=Run(1))
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    pack(source, out, run=Run(1))
+    assert not list(out.rglob("copied-*"))
+    assert not [name for name in out.rglob("zarr.json") if b"copied-" in name.read_bytes()]
 
 
 def test_a_part_that_runs_again_sees_that_its_source_changed(data: Path, tmp_path: Path) -> None:

@@ -198,3 +198,34 @@ def test_three_hundred_thousand_folders_of_a_store_are_dealt_in_seconds(tmp_path
     assert done[0][:2] == done[1][:2] and sum(done[0][:2]) == ManyFolders.count
     assert all(seconds < 10 and memory < 500_000 for _, _, seconds, memory in done), done
     assert 300 <= asked <= 320 and ManyFolders.requests - asked <= 10, (asked, done)
+
+
+@pytest.mark.slow
+def test_finish_says_that_a_part_was_made_by_another_rule_and_what_exists_is_kept(
+    tmp_path, monkeypatch
+):
+    write_sequences(tmp_path / "in", 8)
+    path, out = tmp_path / "list", tmp_path / "out"
+
+    def make(number):
+        run = Run(1, part=Part(number, 2), sequences_from=path)
+        return regrid(tmp_path / "in", SPEC, out, observe=STILL, run=run).made
+
+    with monkeypatch.context() as patch:  # consecutive sequences, as parts were dealt before
+        patch.setattr(Part, "share", lambda part, names: ([*part.take(names)], Part()))
+        assert make(1) == 4
+    before = read_tree(out)
+    make(2)
+    names = open(tmp_path / "in").places()
+    left_out = [name for name in Part(1, 2).share(names)[0] if name not in names[:4]]
+    assert left_out
+    with raises(ConflictError, where=str(out), advice="another rule"):
+        carlasc.finish(out, sequences_from=path)
+    result = carlasc.finish(out, sequences_from=path, incomplete=True)
+    assert [*result.missing] == left_out
+    assert make(1) == len(left_out)
+    assert not carlasc.finish(out, sequences_from=path).missing
+    after = read_tree(out)
+    assert {name: after[name] for name in before if "evaluation" in name} == {
+        name: data for name, data in before.items() if "evaluation" in name
+    }

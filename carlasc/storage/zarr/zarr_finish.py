@@ -19,7 +19,7 @@ from carlasc.running.spreading import Run
 from carlasc.storage.files import AnyPath, damaged, parse_json, remove_stale, to_json
 from carlasc.storage.folder import FolderWriter
 from carlasc.storage.inputs import MadeFrom
-from carlasc.storage.layout import place_of
+from carlasc.storage.layout import COPIED, place_of
 from carlasc.storage.packed.array_layout import (
     FIELD,
     SEQUENCE,
@@ -215,7 +215,7 @@ def _write_metadata(target: Target, paths: list[str], incomplete: bool) -> Finis
         documents = sorted(
             path.removeprefix(f"{node}/{document_node('')}")
             for path in paths
-            if path.startswith(f"{node}/{document_node('')}")
+            if path.startswith(f"{node}/{document_node('')}") and f"/{COPIED}" not in path
         )
         nodes.group(node, {**attributes, "fields": sorted(frames), "documents": documents})
         nodes.fields(node, fields, frames, block)

@@ -19,7 +19,7 @@ from pathlib import Path
 from measuring.figures import Figures, publish
 
 from faults.commands import COMMANDS
-from faults.figures import KINDS, keep, read, write
+from faults.figures import KINDS, code_changed, keep, read, write
 
 
 def chosen_commands(wanted: list[str]) -> list[str]:
@@ -72,6 +72,7 @@ def main() -> int:
             continue
         folder = Path(tempfile.mkdtemp(prefix=f"faults-{name}-"))
         chosen = {"names": chosen_commands(given.command)} if given.command else {}
+        code = code_changed()
         outcome = import_module(kind.module).run(
             given.count or getattr(kind, given.size), given.seed, folder, **chosen
         )
@@ -84,7 +85,8 @@ def main() -> int:
         if not outcome.found:
             shutil.rmtree(folder)
         if not given.keep_figures:
-            keep(outcome, datetime.datetime.now(datetime.UTC).date(), add=given.add)
+            date = datetime.datetime.now(datetime.UTC).date()
+            keep(outcome, date, code, add=given.add)
             publish(Figures.read())
     return int(bool(found))
 

@@ -46,7 +46,7 @@ def cases(base: Path) -> Iterator[Case]:
     yield from _documents(base)
     yield from _captures(base)
     yield from _zips(base)
-    yield from _names(base)
+    yield from names(base)
 
 
 Content = bytes | Callable[[], bytes]
@@ -383,7 +383,9 @@ def _zips(base: Path) -> Iterator[Case]:
     yield Case("a zip with a frame number of 5,000 digits", long, "info x.zip", harmless=True)
 
 
-def _names(base: Path) -> Iterator[Case]:
+def names(base: Path) -> Iterator[Case]:
+    """Yield the cases of names; they need a data set in `base`."""
+
     def name_it(name: str) -> Callable[[Path], None]:
         def make(work: Path) -> None:
             folder = work / "data" / "Train" / name / "cartesian"
@@ -391,8 +393,8 @@ def _names(base: Path) -> Iterator[Case]:
             about = {"format": 2, "sensor": name, "source": name}
             classes = {
                 "name": name,
-                "names": {"0": "free", "1": name, "2": HTML},
-                "colors": {"0": [0, 0, 0], "1": [255, 0, 0], "2": [0, 0, 255]},
+                "names": {"0": "free", **{str(k): f"{name}{HTML}{k}" for k in range(1, 30)}},
+                "colors": {str(k): [255, 8 * k, 0] for k in range(30)},
             }
             (folder / "carlasc.json").write_text(json.dumps(about | {"classes": classes}))
 

@@ -9,8 +9,8 @@ ROOT = Path(__file__).parents[3]
 
 # key -> page, row and column of the first table that has both
 CELLS = {
-    "cell.vehicle.tube": ("docs/studies/movers.md", "tube", "Vehicle"),
-    "cell.vehicle.align": ("docs/studies/movers.md", "align, free space", "Vehicle"),
+    "cell.network.tube": ("docs/studies/networks.md", "tube", "Vehicles"),
+    "cell.network.align": ("docs/studies/networks.md", "align", "Vehicles"),
     "cell.false.tube": ("docs/studies/movers.md", "tube", "wrongly Vehicle"),
     "cell.false.align": ("docs/studies/movers.md", "align, free space", "wrongly Vehicle"),
     "cell.path.tube": ("docs/studies/movers.md", "`tube`", "own path"),
