@@ -89,8 +89,8 @@ CASES = {
     "poses 5 cm off": Case(row=BY_NAME["free space, poses 5 cm"]),
     "poses 20 cm off": Case(row=BY_NAME["free space, poses 20 cm"]),
     "poses 0.5 degrees off": Case(row=BY_NAME["free space, poses 0.5 degrees"]),
-    "20 % wrong labels, in clumps": Case(row=Row("clumps", EVIDENCE, WrongLabels(0.2, 1.0))),
-    "40 % wrong labels": Case(row=Row("wrong", EVIDENCE, WrongLabels(0.4, None))),
+    "20% wrong labels, in clumps": Case(row=Row("clumps", EVIDENCE, WrongLabels(0.2, 1.0))),
+    "40% wrong labels": Case(row=Row("wrong", EVIDENCE, WrongLabels(0.4, None))),
     "flow": Case(row=BY_NAME["align, flow"]),
     "boxes": Case(row=BY_NAME["align, exact boxes"]),
 }
