@@ -12,11 +12,19 @@ See the format page, `docs/format.md#cells`.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray, Int32Array, IntArray
+from carlasc.core.arrays import (
+    AnyFloatArray,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    Int32Array,
+    IntArray,
+)
 from carlasc.core.compiling import cached, fused, inlined, jit
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import GridSpec
@@ -37,6 +45,7 @@ class Cells(NamedTuple):
     voxel_size: Triple
 
     @classmethod
+    @lru_cache(maxsize=16)
     def of(cls, spec: GridSpec) -> Cells:
         """Return the cells of a grid."""
         x, y, z = spec.voxel_size.tolist()
@@ -263,8 +272,40 @@ def _count(points: AnyFloatArray, pose: Pose, cells: Cells, counts: Int32Array) 
             counts[voxel] += 1
 
 
+@cached
+def select_crossing(
+    points: Float32Array,
+    chosen: Int32Array,
+    pose: Pose,
+    lower: Triple,
+    upper: Triple,
+    crosses: BoolArray,
+) -> None:
+    """Find which rays, from the origin to a point, intersect a box.
+
+    Args:
+        points: (N, 3) metres.
+        chosen: (M,) indices of the points.
+        pose: box_T_points, to the frame in which the box is axis-aligned.
+        lower: lower corner of the box.
+        upper: its upper corner.
+        crosses: (M,) output.
+    """
+    for i in range(len(chosen)):
+        x, y, z = points[chosen[i]]
+        ends = transform(pose, np.float64(x), np.float64(y), np.float64(z))
+        enter, leave = -math.inf, math.inf
+        for axis in range(3):
+            origin = pose[4 * axis + 3]
+            along = ends[axis] - origin
+            one, other = (lower[axis] - origin) / along, (upper[axis] - origin) / along
+            # A ray in the plane of a face gives 0/0: fmin and fmax ignore the NaN.
+            enter, leave = max(enter, np.fmin(one, other)), min(leave, np.fmax(one, other))
+        crosses[i] = (enter <= leave) & (leave >= 0.0) & (enter <= 1.0)
+
+
 def warped_voxels(
-    points: FloatArray, spec: GridSpec, warps: FloatArray, later_s: float = 0.0
+    points: AnyFloatArray, spec: GridSpec, warps: FloatArray, later_s: float = 0.0
 ) -> IntArray:
     """Return (W, N) voxels of (N, 3) points under (W, 3, 5) maps p' = A p + b + c dt, as columns A,
     b, c, where `later_s` is dt in seconds; outside, the number of voxels.

@@ -33,6 +33,9 @@ from carlasc.errors import FormatError, check_types, count
 _CENTRE, _CENTRE_M, _STANDING, _NEARER = 0.4, 1.0, 0.2, 1.3
 _SAMPLE = 4000  # points of a scan that tell it
 
+_UPPER = (
+    np.indices((2, 2, 2)).reshape(3, -1).T > 0
+)  # which corners of a box are at its upper bounds
 _TURN = 65_000  # steps of azimuth per turn, of about 0.1 mrad; they fit into 16 bits
 
 
@@ -201,15 +204,13 @@ class RaysFromPlace:
             lower: (3,) lower corner.
             upper: (3,) upper corner.
         """
+        from carlasc.core.cells import as_pose, select_crossing
+
         candidates = self._in_view_of(box_T_sensor, lower, upper)
-        origin = box_T_sensor[:3, 3]
-        rays = transform_points(box_T_sensor, self.points[candidates]) - origin
-        with np.errstate(divide="ignore", invalid="ignore"):
-            one, other = (lower - origin) / rays, (upper - origin) / rays
-        # A ray in the plane of a face gives 0/0: fmin and fmax ignore the NaN.
-        enter = np.fmin(one, other).max(axis=1)
-        leave = np.fmax(one, other).min(axis=1)
-        return candidates[(enter <= leave) & (leave >= 0) & (enter <= 1)]
+        pose, box = as_pose(box_T_sensor), (tuple(lower.tolist()), tuple(upper.tolist()))
+        crosses = np.empty(len(candidates), np.bool_)
+        select_crossing(self.points, candidates, pose, *box, crosses)
+        return candidates[crosses]
 
     def _in_view_of(
         self, box_T_sensor: Transform, lower: FloatArray, upper: FloatArray
@@ -219,10 +220,7 @@ class RaysFromPlace:
         # the sensor is above, below or inside the box
         if ((origin > lower) & (origin < upper))[:2].all():
             return self.order
-        corners = np.stack(
-            np.meshgrid(*zip(lower, upper, strict=True), indexing="ij"), axis=-1
-        ).reshape(-1, 3)
-        seen = transform_points(invert(box_T_sensor), corners)
+        seen = transform_points(invert(box_T_sensor), np.where(_UPPER, upper, lower))
         angles = np.arctan2(seen[:, 1], seen[:, 0])
         middle = np.arctan2(np.sin(angles).sum(), np.cos(angles).sum())
         half = np.abs((angles - middle + np.pi) % (2 * np.pi) - np.pi).max() + 1e-6

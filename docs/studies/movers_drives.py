@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -251,13 +251,16 @@ def label_of(actor: TownActor) -> int:
     return int(np.bincount(actor.mesh.labels).argmax())
 
 
-def reference(kind: str, seed: int, work: Path) -> dict[tuple[str, int], Reference]:
+def reference(
+    kind: str, seed: int, work: Path, grids: Mapping[str, GridSpec] = GRIDS
+) -> dict[tuple[str, int], Reference]:
     """Return the references of a drive by grid and frame; they are made once."""
-    path = work / "references" / f"{kind}{seed}.npz"
+    others = "" if grids is GRIDS else "-".join(["", *grids]).replace(" ", "")
+    path = work / "references" / f"{kind}{seed}{others}.npz"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = path.with_name(f"{kind}{seed}.{os.getpid()}.npz")
-        seen = _see(kind, seed)
+        unfinished = path.with_name(f"{kind}{seed}{others}.{os.getpid()}.npz")
+        seen = _see(kind, seed, grids)
         # mypy: an array could be named like the option; none is
         np.savez_compressed(unfinished, **seen)  # type: ignore[arg-type]
         unfinished.rename(path)
@@ -265,7 +268,7 @@ def reference(kind: str, seed: int, work: Path) -> dict[tuple[str, int], Referen
     found = {}
     for frame in kept["frames"].tolist():
         speeds = {int(actor): float(speed) for actor, speed in kept[f"{frame} speeds"]}
-        for grid in GRIDS:
+        for grid in grids:
             labels, known, owner = (
                 kept[f"{frame} {grid} {name}"] for name in ("labels", "known", "owner")
             )
@@ -277,7 +280,7 @@ def reference(kind: str, seed: int, work: Path) -> dict[tuple[str, int], Referen
     return found
 
 
-def _see(name: str, seed: int) -> dict[str, NDArray[Any]]:
+def _see(name: str, seed: int, grids: Mapping[str, GridSpec]) -> dict[str, NDArray[Any]]:
     """Return the arrays of a drive's references."""
     kind = kind_of(name)
     drive = kind.make(seed, Lidar())
@@ -293,7 +296,7 @@ def _see(name: str, seed: int) -> dict[str, NDArray[Any]]:
         actors = [actor for actor in drive.snapshot(frame).actors.values() if actor.id != EGO_ID]
         speeds = [(actor.id, np.linalg.norm(actor.velocity)) for actor in actors]
         arrays[f"{frame} speeds"] = np.array(speeds, np.float64).reshape(-1, 2)
-        for size, spec in GRIDS.items():
+        for size, spec in grids.items():
             grid = count_votes(seen, spec).to_grid()
             arrays[f"{frame} {size} labels"], arrays[f"{frame} {size} known"] = (
                 grid.labels,
@@ -325,11 +328,7 @@ def choose_frames(drive: TownDrive, kind: Kind) -> list[int]:
 def _owners(actors: list[TownActor], grid_T_world: Transform, spec: GridSpec) -> NDArray[np.uint16]:
     """Return the actor that each voxel may belong to; the smaller one where boxes overlap."""
     owner = np.zeros(spec.num_voxels, np.uint16)
-    centers = (
-        np.indices(spec.size).reshape(3, -1).T * spec.voxel_size
-        + spec.lower
-        + np.array(spec.voxel_size) / 2
-    )
+    centers = spec.from_axes(spec.centers()).reshape(-1, 3)
     bounds = {
         a.id: (a.mesh.vertices.min(axis=0) - _GROW_M, a.mesh.vertices.max(axis=0) + _GROW_M)
         for a in actors

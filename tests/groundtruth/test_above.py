@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from carlasc import GridSpec
-from carlasc.groundtruth.from_scans.above import find_above
+from carlasc.groundtruth.from_scans.frame import find_above
 
 SPEC = GridSpec("cartesian", (6, 5, 8), (0, 0, 0), (2.4, 2.0, 3.2))  # voxels of 0.4 m
 HIGH = 3  # number of voxels above a body

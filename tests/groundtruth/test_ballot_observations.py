@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from carlasc.core.cells import as_pose
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
 from carlasc.groundtruth.voting.ballot import Ballot, ClassPoints, Observation, SeenClass
@@ -45,7 +46,7 @@ def by_class(observations, within=(), sure=None):
             [
                 ClassPoints(
                     np.ascontiguousarray(one.points[one.labels == label].T),
-                    one.grid_T_sensor,
+                    as_pose(one.grid_T_sensor),
                     None if sure is None else sure[one.labels == label],
                 )
                 for one in observations

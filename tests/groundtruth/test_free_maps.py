@@ -71,14 +71,18 @@ def test_a_turned_grid_has_about_as_many_samples():
     assert turned == pytest.approx(level, rel=0.02)
 
 
-@pytest.mark.parametrize("views", [False, True])
-def test_what_was_held_before_leaves_nothing(views):
+@pytest.mark.parametrize("counted", ["samples", "scans", "last"])
+def test_what_was_held_before_leaves_nothing(counted):
     casts = [cast(seed) for seed in range(8)]
-    found = FreeMap(SPEC, STEP_M, views)
-    for scans in ([0, 1, 2, 3, 4], [7, 6, 1, 2, 3, 4], [5, 2, 3, 4], [1, 2, 3, 4, 5]):
+    found = FreeMap(SPEC, STEP_M, counted)
+    for scans in ([0, 1, 2, 3, 4], [7, 6, 1, 2, 3, 4], [5, 2, 3, 4], [1, 2, 3, 4, 5], [4, 5, 6]):
         found.hold(scans, casts.__getitem__)
-        fresh = held(casts, scans[::-1], views=views)
-        assert np.array_equal(found.count(np.eye(4)), fresh.count(np.eye(4)))
+        counts = [
+            one.count(np.eye(4)) for one in (found, held(casts, scans[::-1], counted=counted))
+        ]
+        if counted == "last":  # only whether there are any
+            counts = [held(casts, scans).count(np.eye(4)) > 0, *(one > 0 for one in counts)]
+        assert all(np.array_equal(counts[0], one) for one in counts)
     found.hold([], casts.__getitem__)
     assert not found.count(np.eye(4)).any()
 
@@ -100,7 +104,7 @@ def test_a_scan_that_cannot_be_read_leaves_the_map_as_it_was():
 
 def test_views_count_scans_and_not_samples():
     casts = [cast(seed, 4000) for seed in range(3)]
-    views = held([*casts, casts[0]], views=True).count(np.eye(4))
+    views = held([*casts, casts[0]], counted="scans").count(np.eye(4))
     seen = [plain([rays]) > 0 for rays in casts]
     expected = seen[0] * 2 + seen[1] + seen[2]
     assert np.count_nonzero(views != expected) <= 2
@@ -158,9 +162,10 @@ def test_memory_does_not_grow_along_a_drive():
     assert not found._blocks.counts.any()
 
 
-def test_a_cylindrical_grid_has_no_gaps_near_its_axis():
+@pytest.mark.parametrize("fine", [False, True])
+def test_a_cylindrical_grid_has_no_gaps_near_its_axis(fine):
     spec = GridSpec("cylindrical", (20, 90, 8), (0.0, -np.pi, -1.6), (8.0, np.pi, 1.6))
-    found = FreeMap(spec, STEP_M)
+    found = FreeMap(spec, STEP_M, fine=fine)
     rays = cast(0, 60_000)
     found.hold([0], lambda scan: rays)
     counts = found.count(np.eye(4)).reshape(spec.size)
@@ -168,4 +173,5 @@ def test_a_cylindrical_grid_has_no_gaps_near_its_axis():
     assert counts.sum() == pytest.approx(expected.sum(), rel=0.1)
     ring = slice(3, 15)
     assert (counts[ring] > 0).mean() > 0.99
-    assert np.corrcoef(counts[ring].ravel(), expected[ring].ravel())[0, 1] > 0.8
+    alike = np.corrcoef(counts[ring].ravel(), expected[ring].ravel())[0, 1]
+    assert alike > (0.9 if fine else 0.8)  # small cells are more exact

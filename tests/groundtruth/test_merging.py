@@ -98,7 +98,8 @@ def in_bodies(merging, frame=15, window=FRAMES, **options):
 
 
 def in_world(one, frame=15):
-    return transform_points(sensor_pose(frame) @ one.grid_T_points, one.points.T)
+    grid_T_points = np.vstack([np.reshape(one.grid_T_points, (3, 4)), [0, 0, 0, 1]])
+    return transform_points(sensor_pose(frame) @ grid_T_points, one.points.T)
 
 
 def test_a_persons_shape_is_used_for_eight_frames_and_a_vehicles_for_all():

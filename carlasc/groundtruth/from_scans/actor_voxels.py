@@ -17,6 +17,7 @@ from carlasc.core.arrays import (
     IntArray,
     Uint32Array,
 )
+from carlasc.core.cells import warped_voxels
 from carlasc.core.geometry import invert, multiply, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import finite
@@ -127,25 +128,25 @@ def _number_points(
     instance: Uint32Array,
 ) -> None:
     """Give voxels without an actor the most frequent number of the static points in them."""
-    if "instances" not in feed.sequence.fields():
+    if "instances" not in feed.sequence.fields() or not window:
         return
     moving = {track.instance for track in actors.tracks.values()}
     kept = _NUMBERED.setdefault(feed, {})
     for old in [frame for frame in kept if frame < now.frame + feed.options.window[0]]:
         del kept[old]
-    pairs = [np.empty(0, np.int64)]
     for frame in window:
         if frame not in kept:
             kept[frame] = _numbered(feed, frame)
-        points, numbers = kept[frame]
-        static = ~np.isin(numbers, list(moving))
-        points, numbers = points[static], numbers[static]
-        flat = spec.flat_index(transform_points(now.grid_T_world, points))
-        used = flat >= 0
-        used[used] = free[flat[used]]
-        # voxel and number in one integer: `unique` of integers is faster than of rows
-        pairs.append(flat[used].astype(np.int64) << 32 | numbers[used])
-    keys, counts = np.unique(np.concatenate(pairs), return_counts=True)
+    points, numbers = (
+        np.concatenate(part) for part in zip(*(kept[frame] for frame in window), strict=True)
+    )
+    static = ~np.isin(numbers, list(moving))
+    grid_T_world = np.column_stack([now.grid_T_world[:3], np.zeros(3)])[None]
+    (voxels,) = warped_voxels(points[static], spec, grid_T_world)
+    used = np.append(free, False)[voxels]
+    # voxel and number in one integer: `unique` of integers is faster than of rows
+    pairs = voxels[used] << 32 | numbers[static][used]
+    keys, counts = np.unique(pairs, return_counts=True)
     order = np.argsort(counts, kind="stable")  # the most frequent number is written last
     instance[keys[order] >> 32] = (keys[order] & 0xFFFFFFFF).astype(np.uint32)
 

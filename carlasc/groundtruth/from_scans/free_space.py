@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Collection, Iterable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -33,6 +33,8 @@ _EDGE = 1 << _BITS
 _CELL_M = 0.05
 _MOST = 8  # greatest number of cells along an edge of a voxel, as in those of 0.4 m; least: 2
 _FEWEST = 256  # least number of blocks by which a map grows
+Counted = Literal["samples", "scans", "last"]
+"""What cells count: samples, or scans; or they keep the last scan, which takes no removal."""
 
 
 class FreeSpace:
@@ -66,8 +68,8 @@ class FreeSpace:
         """Return what the rays of a window passed through: counts of each of (M,) voxels.
 
         Args:
-            kind: "scene": by the rule of votes; "views": scans; "recent": samples of scans within
-                `RECENT_S` of a frame.
+            kind: "scene": by the rule of votes; "views": scans; "recent": whether scans within
+                `RECENT_S` of a frame saw the voxel, as 0 and other numbers.
             now: the frame.
             window: frames of the scans.
             voxels: (M,) flat indices; None: all voxels.
@@ -91,9 +93,10 @@ class FreeSpace:
     def _map_of(self, kind: str | int, now: Instant) -> FreeMap:
         key, plan = (now.frame % self._stride, kind), self.plan
         if key not in self._maps:
-            views = kind == "views" or (plan.rule == "sensor" and kind != "recent")
+            counted: Counted = "scans" if plan.rule == "sensor" else "samples"
+            counted = "last" if kind == "recent" else "scans" if kind == "views" else counted
             fine, step_m = isinstance(kind, int), plan.voting.free_step_m
-            self._maps[key] = FreeMap(plan.spec, step_m, views, fine=fine)
+            self._maps[key] = FreeMap(plan.spec, step_m, counted, fine=fine)
         return self._maps[key]
 
     def forget_others(self, actors: Collection[int]) -> None:
@@ -112,8 +115,8 @@ class _Blocks(NamedTuple):
         slots: (X, Y, Z) index of each block in `counts`; -1 without one.
         unused: (U,) indices; the first ones are of blocks that are not in use.
         left: (1,) how many of them there are.
-        counts: (B, cells) samples in each cell.
-        stamps: (B, cells) the last scan that was added or removed; empty if every sample counts.
+        counts: (B, cells) samples or scans in each cell, or the last scan.
+        stamps: (B, cells) the last scan that was added or removed, if scans are counted.
     """
 
     first: IntArray
@@ -130,22 +133,24 @@ class FreeMap:
     Args:
         spec: the grids that take their free space from the map.
         step_m: distance between two samples of a ray, metres.
-        views: count the scans that saw each voxel, instead of samples in cells.
+        counted: what cells count. Those that count scans are as large as a voxel.
         fine: make the cells as small in x and y as in z, for small things.
     """
 
     def __init__(
-        self, spec: GridSpec, step_m: float, views: bool = False, *, fine: bool = False
+        self, spec: GridSpec, step_m: float, counted: Counted = "samples", *, fine: bool = False
     ) -> None:
         x, y, z = spec.voxel_size.tolist()
         # a cylindrical voxel is as wide as deep at some radius
         size = (x, x if spec.coordinates == "cylindrical" else y, z)
         parts = [min(max(round(edge / _CELL_M), 2), _MOST) for edge in size]
-        self.spec, self.views, self._step_m, self._stamp = spec, views, step_m, 0
-        self._parts = (1, 1, 1) if views else (*(parts[:2] if fine else (2, 2)), parts[2])
+        self.spec, self._counted, self._step_m, self._stamp = spec, counted, step_m, 0
+        across = tuple(parts[:2]) if fine else (2, 2)
+        self._parts = (1, 1, 1) if counted == "scans" else (*across, parts[2])
         self._cell = np.array(size) / self._parts
         self._margin_m = np.linalg.norm(size)  # a voxel that touches a region is counted whole
-        self._held = dict[int, tuple[Cast, IntArray, IntArray]]()
+        # the rays of each scan, the first and the last block of their region, and the scan's stamp
+        self._held = dict[int, tuple[Cast, IntArray, IntArray, int]]()
         self._clear()
 
     def _clear(self) -> None:
@@ -163,11 +168,18 @@ class FreeMap:
             cast_of: returns the rays of a scan.
         """
         others = [scan for scan in self._held if scan not in scans]
-        if 2 * len(others) > len(self._held):  # adding the rest anew costs less than removing these
+        is_last = self._counted == "last"
+        if is_last:  # earlier scans than those that stay need not be removed; others cannot be
+            first = min((held[3] for scan, held in self._held.items() if scan in scans), default=0)
+            anew = any(self._held[scan][3] > first for scan in others)
+        else:  # adding the rest anew may cost less than removing these
+            anew = 2 * len(others) > len(self._held)
+        if anew:
             self._clear()
-        else:
-            for scan in others:
-                self._trace(*self._held.pop(scan), -1)
+        for scan in () if anew else others:
+            cast, lower, upper, _ = self._held.pop(scan)
+            if not is_last:
+                self._trace(cast, lower, upper, -1)
         for scan in scans:
             if scan not in self._held:
                 cast = cast_of(scan)
@@ -178,11 +190,11 @@ class FreeMap:
                 upper = np.maximum(upper + 1, lower)  # a region may be empty
                 try:
                     self._make_room(lower, upper)
-                    self._trace(cast, lower, upper, 1)
+                    self._trace(cast, lower, upper, 0 if is_last else 1)
                 except BaseException:  # half a scan must not stay
                     self._clear()
                     raise
-                self._held[scan] = cast, lower, upper
+                self._held[scan] = cast, lower, upper, self._stamp
 
     def _trace(self, cast: Cast, lower: IntArray, upper: IntArray, sign: int) -> None:
         self._stamp += 1
@@ -210,7 +222,7 @@ class FreeMap:
         """Make room for more blocks."""
         old, size = self._blocks, len(self._blocks.counts)
         more = max(size // 4, _FEWEST)
-        for cells in (old.counts, old.stamps) if self.views else (old.counts,):
+        for cells in (old.counts, old.stamps) if self._counted == "scans" else (old.counts,):
             cells.resize((size + more, _EDGE**3), refcheck=False)  # without a copy
         # the lowest ones are taken first, from the end: memory that was used before
         unused = np.concatenate([np.arange(size + more - 1, size - 1, -1), old.unused])
@@ -247,7 +259,10 @@ class FreeMap:
         cells_T_grid = map_T_grid.copy()
         cells_T_grid[:3] /= self._cell[:, None]
         pose, cells, volume = as_pose(cells_T_grid), Cells.of(self.spec), float(self._cell.prod())
-        _gather(chosen, pose, cells, self._parts, volume, self._blocks, found)
+        least = 1
+        if self._counted == "last":
+            least = min((held[3] for held in self._held.values()), default=1)
+        _gather(chosen, pose, cells, self._parts, volume, least, self._blocks, found)
         return found
 
 
@@ -274,8 +289,8 @@ def _trace(
         region: the cells of the region, of whole blocks.
         step_m: distance between two samples, metres.
         begin: (3,) the first block of the region, counted from that of the map.
-        change: what a sample adds, and a number that no scan before had, which the cells get if
-            views are counted: a scan counts once in each.
+        change: what a sample adds, or 0: the cells get the stamp; and the stamp, a number that no
+            scan before had. If scans are counted, each counts once in a cell.
         blocks: the blocks.
     """
     # A scan is removed with the poses, the region and the arithmetic with which it was added. So
@@ -317,7 +332,7 @@ def _trace(
                         if stamps[slot, cell] == stamp:
                             continue
                         stamps[slot, cell] = stamp
-                    counts[slot, cell] += sign
+                    counts[slot, cell] = counts[slot, cell] + sign if sign else stamp
             ray += count
     return ray
 
@@ -337,10 +352,15 @@ def _steps(inside: float, stride: float) -> float:
 
 @jit
 def _add_column(
-    start: Triple, stride: Triple, slots: Int32Array, counts: Int32Array, column: IntArray
+    start: Triple,
+    stride: Triple,
+    least: int,
+    slots: Int32Array,
+    counts: Int32Array,
+    column: IntArray,
 ) -> None:
     """Add the counts of the cells at `start + k * stride`, in cells from the first one, to
-    `column[k]`.
+    `column[k]`, if they are at least `least`.
     """
     end_x, end_y, end_z = slots.shape
     k = 0
@@ -359,7 +379,8 @@ def _add_column(
                 slot, above = slots[a, b, begin >> _BITS], min((begin | (_EDGE - 1)) + 1, end)
                 if slot >= 0:
                     for other in range(begin, above):
-                        column[k + other - low] += counts[slot, cell + (other & (_EDGE - 1))]
+                        value = counts[slot, cell + (other & (_EDGE - 1))]
+                        column[k + other - low] += value if value >= least else 0
                 begin = above
         k += number
 
@@ -371,6 +392,7 @@ def _gather(
     cells: Cells,
     parts: tuple[int, int, int],
     volume: float,
+    least: int,
     blocks: _Blocks,
     found: Uint32Array,
 ) -> None:
@@ -382,6 +404,7 @@ def _gather(
         cells: the grid.
         parts: number of cells along the edges of a voxel.
         volume: of a cell.
+        least: smaller counts are 0.
         blocks: the blocks.
         found: (M,) or (V,) output.
     """
@@ -401,9 +424,9 @@ def _gather(
         ):
             height += 1
         if cells.cylindrical and along > 1:
-            # about one place in the width of each cell, as in x, but not more than 16
+            # about one place in the width of each cell, as in x, but not too many
             wide = (cells.lower[0] + (i + 0.5) * voxel_size[0]) * voxel_size[1]
-            many = int(min(max(math.ceil(2 * wide / voxel_size[0]), 1.0), 16.0))
+            many = int(min(max(math.ceil(along * wide / voxel_size[0]), 1.0), 8.0 * along))
             weight = wide * voxel_size[0] * voxel_size[2] / (across * many * up * volume)
         column = columns[: height * up]
         column[:] = 0
@@ -415,7 +438,7 @@ def _gather(
                     x, y = u * math.cos(y), u * math.sin(y)
                 x, y, z = transform(pose, x, y, cells.lower[2] + (k + 0.5 / up) * voxel_size[2])
                 start = x - (first[0] << _BITS), y - (first[1] << _BITS), z - (first[2] << _BITS)
-                _add_column(start, stride, blocks.slots, blocks.counts, column)
+                _add_column(start, stride, least, blocks.slots, blocks.counts, column)
         for k in range(height):
             total = column[k * up : (k + 1) * up].sum()
             # rays passed through the voxel: it does not become unknown by rounding

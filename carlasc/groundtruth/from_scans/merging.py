@@ -12,7 +12,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -27,6 +27,7 @@ from carlasc.core.arrays import (
     LabelArray,
     Uint16Array,
 )
+from carlasc.core.cells import as_pose
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import GridSpec
@@ -45,6 +46,7 @@ RECENT_S = 0.25  # scans within this time before and after a frame show the scen
 # across and up.
 _AROUND_M = np.array([0.3, 0.3, 0.1])
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+_ByClass = dict[int, tuple[Float32Array, Float32Array | None]]  # points and their probabilities
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class Instant:
     seconds: float
     world_T_grid: Transform
 
-    @property
+    @cached_property
     def grid_T_world(self) -> Transform:
         """(4, 4), the inverse of the grid's pose."""
         return invert(self.world_T_grid)
@@ -260,7 +262,7 @@ class Merger:
         self._static = dict[int, BoolArray]()
         self._labels = dict[int, Uint16Array]()
         self._moving = dict[int, Float32Array]()
-        self._points = defaultdict[int, dict[bool, dict[int, ClassPoints]]](dict)
+        self._points = defaultdict[int, dict[bool, _ByClass]](dict)
         self._carried = defaultdict[int, dict[int, _Carried | None]](dict)
 
     def forget_before(self, frame: int) -> None:
@@ -291,20 +293,19 @@ class Merger:
                 all_vote = self.dynamic == "tube" or (own and self.dynamic != "drop")
                 votes = ~self.actors.is_own(scan.points) if all_vote else self.static(other)
                 kept[own] = self._by_class(scan, votes)
-            pose = now.grid_T_world @ scan.world_T_sensor
-            for label, seen in kept[own].items():
-                found[label].append(seen._replace(grid_T_points=pose))
+            pose = as_pose(now.grid_T_world @ scan.world_T_sensor)
+            for label, (points, sure) in kept[own].items():
+                found[label].append(ClassPoints(points, pose, sure))
         return [SeenClass(label, points) for label, points in found.items()]
 
-    def _by_class(self, scan: PreparedScan, votes: BoolArray) -> dict[int, ClassPoints]:
-        """Return the points of a scan that vote, (N,) bool, by class; their poses are not set."""
-        found, labels = {}, np.where(votes, self.labels(scan.frame), np.uint16(0))
+    def _by_class(self, scan: PreparedScan, votes: BoolArray) -> _ByClass:
+        """Return the points of a scan that vote, (N,) bool, and how sure they are, by class."""
+        found, labels = _ByClass(), np.where(votes, self.labels(scan.frame), np.uint16(0))
         for label in np.flatnonzero(np.bincount(labels)).tolist():
             if label:
                 rows = np.flatnonzero(labels == label)
                 points = np.ascontiguousarray(scan.points[rows].T)
-                sure = None if scan.sure is None else scan.sure[rows]
-                found[label] = ClassPoints(points, scan.world_T_sensor, sure)
+                found[label] = points, None if scan.sure is None else scan.sure[rows]
         return found
 
     def bodies(
@@ -326,7 +327,7 @@ class Merger:
             if pose is None or (mirror and not (track.rigid and any(track.extent.known))):
                 continue
             pose = pose @ _MIRROR if mirror else pose
-            casts, points, grid_T_actor = {}, [], now.grid_T_world @ pose
+            casts, points, grid_T_actor = {}, [], as_pose(now.grid_T_world @ pose)
             for other in window:
                 if mirror or other != now.frame:
                     carried = self._carry(number, other, now)
@@ -356,7 +357,7 @@ class Merger:
             pose = track.pose(now.frame)
             if len(track.surface) and pose is not None:
                 surface = np.ascontiguousarray(track.surface.T)
-                points = [ClassPoints(surface, now.grid_T_world @ pose)]
+                points = [ClassPoints(surface, as_pose(now.grid_T_world @ pose))]
                 yield SeenClass(track.label, points, regions.of_voxel, region)
 
     def static(self, frame: int) -> BoolArray:
@@ -499,26 +500,7 @@ class BodyRegions:
             np.zeros(spec.num_voxels, np.bool_),
             np.zeros(spec.num_voxels, np.bool_),
         )
-        size = spec.voxel_size
-        # Cells of a column share x and y: a body is compared with columns first, then with the
-        # cells of the few columns near it. x and y of the centres of the columns of cells, (C, 2),
-        # z of the centres in each, and half the extent of the cells.
-        columns = spec.from_axes(replace(spec, size=(*spec.size[:2], 1)).centers())[
-            :, :, 0, :2
-        ].reshape(-1, 2)
-        columns, heights = (
-            columns.astype(np.float64),
-            spec.lower[2] + (np.arange(spec.size[2]) + 0.5) * size[2],
-        )
-        width = (
-            np.hypot(columns[:, 0], columns[:, 1]) * size[1]
-            if spec.coordinates == "cylindrical"
-            else size[1]
-        )
-        across, up = (
-            np.broadcast_to(np.maximum(size[0], width) / 2, len(columns)),
-            float(size[2] / 2),
-        )
+        columns, heights, across, up = _columns_of(spec)
         largest_first = sorted(bodies, key=lambda body: -float(np.prod(body[1].size)))
         for region, (_, track, pose) in enumerate(largest_first, 1):
             actor_T_grid = invert(pose) @ world_T_grid
@@ -526,6 +508,8 @@ class BodyRegions:
             middle = invert(actor_T_grid)[:2, 3]
             reach = float(np.linalg.norm(np.maximum(-track.lower, track.upper))) + across + up
             near = np.flatnonzero((np.abs(columns - middle) < reach[:, None]).all(axis=1))
+            if not len(near):
+                continue
             cells = np.column_stack(
                 [np.repeat(columns[near], len(heights), axis=0), np.tile(heights, len(near))]
             )
@@ -547,6 +531,22 @@ class BodyRegions:
         present = np.unique(of_voxel[of_voxel != STATIC]).tolist()
         actors = {region: largest_first[region - 1][0] for region in present}
         return cls(of_voxel, actors, np.flatnonzero(hidden), np.flatnonzero(hidden_ends))
+
+
+@lru_cache(maxsize=4)
+def _columns_of(spec: GridSpec) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Return the columns of the cells of a grid: x and y of their centres, (C, 2), z of the centres
+    in each, and half the extent of the cells, (C,) across and up, all in metres.
+    """
+    # Cells of a column share x and y: a body is compared with columns first, then with the cells of
+    # the few columns near it.
+    size = spec.voxel_size
+    centers = spec.from_axes(replace(spec, size=(*spec.size[:2], 1)).centers())
+    columns = centers[:, :, 0, :2].reshape(-1, 2).astype(np.float64)
+    heights = spec.lower[2] + (np.arange(spec.size[2]) + 0.5) * size[2]
+    is_curved = spec.coordinates == "cylindrical"
+    width = np.hypot(*columns.T) * size[1] if is_curved else np.full(len(columns), size[1])
+    return columns, heights, np.maximum(size[0], width) / 2, float(size[2] / 2)
 
 
 def _on_hidden_face(

@@ -105,16 +105,16 @@ class ClassPoints(NamedTuple):
 
     Attributes:
         points: (3, N) float32, metres.
-        grid_T_points: (4, 4).
+        grid_T_points: the pose of the points.
         sure: (N,) float32, probability of the class of each point; None: 1.
     """
 
     points: Float32Array
-    grid_T_points: Transform
+    grid_T_points: Pose
     sure: Float32Array | None = None
 
 
-_EVERYWHERE = np.empty(0, np.uint16)
+_EVERYWHERE, _CERTAIN = np.empty(0, np.uint16), np.empty(0, np.float32)
 
 
 class SeenClass(NamedTuple):
@@ -267,7 +267,6 @@ class Ballot:
 
     def add_points(self, seen: Iterable[SeenClass]) -> None:
         """Add the votes of points without rays, one class after the other."""
-        from carlasc.core.cells import as_pose
         from carlasc.groundtruth.voting import kernel
 
         counted = np.zeros(self.spec.num_voxels + 1, kernel.HIT_DTYPE)
@@ -276,12 +275,13 @@ class Ballot:
             hit = np.empty(min(points, len(counted)), np.int32)
             certain = all(one.sure is None for one in voters)
             doubt = np.zeros(0 if certain else len(counted), np.float32)
-            for voter, one in enumerate(voters, 1):
-                pose, sure = as_pose(one.grid_T_points), _ready(one.sure, np.float32)
+            for voter, (place, pose, sure) in enumerate(voters, 1):
+                doubts = _CERTAIN if sure is None else sure
                 number = kernel.count_hits(
-                    one.points, sure, pose, self._cells, voter, counted, doubt, hit, number
+                    place, doubts, pose, self._cells, voter, counted, doubt, hit, number
                 )
-                self._widen(one.points, pose, regions, region)
+                if self._boxes is not None:
+                    self._widen(place, pose, regions, region)
             self._make_room(number)
             kernel.add_hits(label, counted, doubt, hit[:number], regions, region, self._tally)
 
@@ -290,9 +290,8 @@ class Ballot:
     ) -> None:
         from carlasc.groundtruth.voting import filled
 
-        if self._boxes is not None:
-            ready = _ready(points, np.float32)
-            filled.widen_boxes(ready, pose, self._cells, regions, region, self._boxes)
+        ready = _ready(points, np.float32)
+        filled.widen_boxes(ready, pose, self._cells, regions, region, self._boxes)
 
     @property
     def free(self) -> AnyArray:
@@ -340,12 +339,12 @@ class Ballot:
             self._tally = self._tally._replace(candidates=grown)
 
 
-def _ready(values: AnyArray | None, dtype: type[np.generic]) -> AnyArray:
-    """Return an array as the compiled loops take it; empty for None.
+def _ready(values: AnyArray, dtype: type[np.generic]) -> AnyArray:
+    """Return an array as the compiled loops take it.
 
     Numba compiles a loop again for each layout of its arrays, read-only ones too.
     """
-    return np.empty(0, dtype) if values is None else np.require(values, dtype, ["C", "A", "W"])
+    return np.require(values, dtype, ["C", "A", "W"])
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,7 +42,7 @@ from carlasc.core.arrays import (
     Uint16Array,
 )
 from carlasc.core.classes import ClassTable
-from carlasc.core.compiling import cached, jit
+from carlasc.core.compiling import cached, inlined, jit
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
 from carlasc.storage import field_files, layout
@@ -257,6 +257,7 @@ class _Cast(NamedTuple):
         begins: (N + 1,) int64 first row of each voxel in `own` and `weight`.
         own: (M,) int64 class of each row, as an index.
         weight: (M,) float64 votes of each row.
+        total: (N,) float64 votes of each voxel.
         rows: (V,) int32 index of each voxel of the grid in `voxels`; -1 without votes.
         size: (3,) int64 of the grid.
     """
@@ -265,6 +266,7 @@ class _Cast(NamedTuple):
     begins: IntArray
     own: IntArray
     weight: FloatArray
+    total: FloatArray
     rows: Int32Array
     size: IntArray
 
@@ -312,7 +314,8 @@ def agree(votes: AnyArray, spec: GridSpec, classes: ClassTable) -> ClassConsensu
         votes["votes"], begins[:-1]
     )
     weight = votes["sure"] * np.repeat(scans, np.diff(begins))
-    cast = _Cast(voxels, begins, own, weight, rows, np.array(spec.size))
+    total = np.asarray(np.bincount(rows[votes["voxel"]], weight), np.float64)
+    cast = _Cast(voxels, begins, own, weight, total, rows, np.array(spec.size))
 
     # The majority in voxels with many scans stands for the truth there, instead of the iterations
     # of Dawid and Skene. Classes without such voxels get the usual share of errors, spread evenly
@@ -363,18 +366,20 @@ def _needed(confusion: FloatArray, frequency: FloatArray) -> FloatArray:
     return np.asarray(needed.max(axis=0), np.float64)
 
 
-@jit
-def _neighbour(cast: _Cast, i: int, x: int, y: int, z: int) -> int:
-    """Return the index of the voxel at an offset of x, y and z voxels from voxel i; -1 if it is
-    outside of the grid or has no votes.
-    """
+@inlined
+def _cell(cast: _Cast, i: int) -> tuple[int, int, int]:
+    """Return the cell of voxel i in the grid."""
     voxel, size = cast.voxels[i], cast.size
-    a = voxel // (size[1] * size[2]) + x
-    b = voxel // size[2] % size[1] + y
-    c = voxel % size[2] + z
+    return voxel // (size[1] * size[2]), voxel // size[2] % size[1], voxel % size[2]
+
+
+@inlined
+def _row(cast: _Cast, a: int, b: int, c: int) -> int:
+    """Return the index of the voxel of a cell; -1 if it is outside of the grid or has no votes."""
+    size = cast.size
     if a < 0 or b < 0 or c < 0 or a >= size[0] or b >= size[1] or c >= size[2]:
         return -1
-    return int(cast.rows[(a * size[1] + b) * size[2] + c])
+    return cast.rows[(a * size[1] + b) * size[2] + c]
 
 
 @cached
@@ -392,19 +397,27 @@ def _compare(cast: _Cast, confusion: FloatArray, frequency: FloatArray) -> None:
         most[i] = own[best]
         frequency[most[i]] += 1
     for i in range(len(voxels)):
-        total = weight[begins[i] : begins[i + 1]].sum()
-        around = 0
-        for x in range(-1, 2):
-            for y in range(-1, 2):
-                for z in range(-1, 2):
-                    other = _neighbour(cast, i, x, y, z)
-                    if other >= 0:  # counts the voxel itself too
-                        # -27 outweighs all others: one neighbour of another class is a border,
-                        # where the errors of positions look like errors of labels
-                        around += 1 if most[other] == most[i] else -27
-        if total >= _MIN_SCANS and around >= 3:
+        if cast.total[i] >= _MIN_SCANS and _is_inside(cast, i, most):
             for row in range(begins[i], begins[i + 1]):
                 confusion[most[i], own[row]] += weight[row]
+
+
+@jit
+def _is_inside(cast: _Cast, i: int, most: IntArray) -> bool:
+    """Return whether at least two neighbours of a voxel have votes, all most for its class."""
+    around = 0
+    a, b, c = _cell(cast, i)
+    for x in range(a - 1, a + 2):
+        for y in range(b - 1, b + 2):
+            for z in range(c - 1, c + 2):
+                other = _row(cast, x, y, z)
+                if other >= 0:  # counts the voxel itself too
+                    # One neighbour of another class is a border, where the errors of positions look
+                    # like errors of labels.
+                    if most[other] != most[i]:
+                        return False
+                    around += 1
+    return around >= 3
 
 
 @cached
@@ -461,20 +474,20 @@ def _posterior(
     out: Float32Array,
 ) -> None:
     """Write the probability of each class of a voxel from its votes and a prior."""
-    begins, own, weight = cast.begins, cast.own, cast.weight
+    begins, own, weight, total = cast.begins, cast.own, cast.weight, cast.total[i]
     scores = np.log(prior + _LEAST_PRIOR)
-    total = weight[begins[i] : begins[i + 1]].sum()
+    likely = few if total < _FEW else many
     for row in range(begins[i], begins[i + 1]):
-        likely = few[:, own[row]] if total < _FEW else many[:, own[row]]
-        scores += min(1.0, _ENOUGH_VOTES / total) * weight[row] * likely
+        votes = min(1.0, _ENOUGH_VOTES / total) * weight[row]
+        for c in range(len(prior)):
+            scores[c] += votes * likely[c, own[row]]
     # The best score becomes 0 before the exponential, which cannot overflow then.
-    best = scores.max()
-    total = 0.0
+    best, whole = scores.max(), 0.0
     for c in range(len(prior)):
         scores[c] = np.exp(scores[c] - best)
-        total += scores[c]
+        whole += scores[c]
     for c in range(len(prior)):
-        out[c] = scores[c] / total
+        out[c] = scores[c] / whole
 
 
 @jit
@@ -490,21 +503,22 @@ def _neighbour_prior(
 
     Near neighbours, and those with many votes, have more weight.
     """
-    begins, own, weight = cast.begins, cast.own, cast.weight
     # the share of each class counts like a tenth of a neighbour: it decides where there is none
     total = 0.1
     prior[:] = 0.1 * frequency
+    a, b, c = _cell(cast, i)
     for x in range(-_REACH[0], _REACH[0] + 1):
         for y in range(-_REACH[1], _REACH[1] + 1):
             for z in range(-_REACH[2], _REACH[2] + 1):
-                other = -1 if x == y == z == 0 else _neighbour(cast, i, x, y, z)
+                other = -1 if x == y == z == 0 else _row(cast, a + x, b + y, c + z)
                 if other >= 0:
-                    votes = weight[begins[other] : begins[other + 1]].sum()
+                    votes = cast.total[other]
                     part = votes / (votes + 2) / (1 + x * x + y * y + 2 * z * z)
                     if place[other] >= 0:
-                        prior += part * shares[place[other]]
+                        for kind in range(len(prior)):
+                            prior[kind] += part * shares[place[other], kind]
                     else:
-                        prior[own[begins[other]]] += part
+                        prior[cast.own[cast.begins[other]]] += part
                     total += part
     prior /= total
 
@@ -521,8 +535,7 @@ def _mix_shares(
     """Replace the class probabilities of a voxel by the shares of classes that fit its votes: a
     voxel may hold two objects.
     """
-    begins, own, weight = cast.begins, cast.own, cast.weight
-    total = weight[begins[i] : begins[i + 1]].sum()
+    begins, own, weight, total = cast.begins, cast.own, cast.weight, cast.total[i]
     # Expectation and maximisation of a mixture: each vote is split among the classes that explain
     # it, and the likeliest classes keep a prior. The start is between both, so that no share of a
     # class with votes is 0: a share of 0 would stay 0.
