@@ -246,8 +246,15 @@ class DerivedCopy:
         with _naming_replaced(Path(self.out)):
             if self.mark is None:
                 copied = UnpackResult(str(self.out) if is_url(self.out) else Path(self.out))
-                sink, made_from, again = FolderSink(self.out), self.made_from, self.overwrite
-                write_files(sequences, sink, copied, run, self.part, made_from, again=again)
+                write_files(
+                    sequences,
+                    FolderSink(self.out),
+                    copied,
+                    run,
+                    self.part,
+                    self.made_from,
+                    again=self.overwrite,
+                )
             else:
                 copied = unpack(ChosenSequences(self.source.location, sequences), self.out, run=run)
         self._finish(sequences)
