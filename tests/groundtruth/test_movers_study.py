@@ -268,7 +268,7 @@ def test_the_tasks_cover_the_report(tmp_path):
     }
     assert {(32, "coarse", row.name) for row in (*ROWS, *ABLATIONS)} <= made
     others = {(16, "coarse"), (64, "coarse"), (32, "0.2 m")}
-    assert {(*other, "align, evidence") for other in others} <= made
+    assert {(*other, "align, free space") for other in others} <= made
     assert len({task.setting.drive for task in tasks}) == 10
     parked = tasks_of(argparse.Namespace(parked=True, **options))
     assert {task.setting.seed for task in parked} == {1, 2, 3}
