@@ -18,7 +18,7 @@ def test_the_study_prints_the_rows_of_its_page(tmp_path):
         [cell.strip() for cell in line.strip("|").split("|")] for line in done.stdout.splitlines()
     ]
     first, second, others = rows[:2], rows[2:6], done.stdout.splitlines()[6:]
-    labelled, right, of_all, voxels = (float(cell.removesuffix(" %")) for cell in first[1][1:])
+    labelled, right, of_all, voxels = (float(cell.removesuffix("%")) for cell in first[1][1:])
     assert min(labelled, right, of_all, voxels) > 90
     assert [row[1] for row in second[1:]] == [
         "coarse, one LiDAR",
@@ -27,7 +27,7 @@ def test_the_study_prints_the_rows_of_its_page(tmp_path):
     ]
     for row in second[1:]:
         uncut, late, early, filled, whole, share, by_centre = (
-            float(cell.removesuffix(" %")) for cell in row[2:]
+            float(cell.removesuffix("%")) for cell in row[2:]
         )
         assert uncut > 99 and abs(uncut + late + early - 100) < 0.02
         # one LiDAR fills few voxels that no edge cuts

@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import signal
 from pathlib import Path
 
 import numpy as np
@@ -376,10 +375,14 @@ def test_a_capture_without_its_last_frame(tmp_path):
     assert outputs(tmp_path / "out") == outputs(tmp_path / "fresh")
 
 
+def interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
 def test_frames_that_are_lost_after_a_run_was_killed_at_its_begin(tmp_path, monkeypatch):
     write_capture(tmp_path / "data", frames=2)
     with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
-        killed.setattr(InputCheck, "look", lambda *arguments: os.kill(os.getpid(), signal.SIGINT))
+        killed.setattr(InputCheck, "look", interrupt)
         regrid(tmp_path / "data", SPEC, tmp_path / "out", run=ALONE)
     assert len((tmp_path / "out/cartesian/times.txt").read_text().split()) == 2
     for path in (tmp_path / "data/raw").glob("*/101.npy"):
@@ -393,9 +396,7 @@ def test_frames_that_are_lost_after_a_run_was_killed_at_its_begin(tmp_path, monk
 def test_scans_that_are_lost_after_convert_was_killed_at_its_begin(tmp_path, monkeypatch):
     write_tiny_kitti(tmp_path / "kitti", frames=3)
     with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
-        killed.setattr(
-            Conversion, "_read_scans", lambda *arguments: os.kill(os.getpid(), signal.SIGINT)
-        )
+        killed.setattr(Conversion, "_read_scans", interrupt)
         convert("kitti", tmp_path / "kitti", tmp_path / "out", grids=None, poses=FORCED, run=ALONE)
     (text,) = (tmp_path / "out").rglob("times.txt")
     assert len(text.read_text().split()) == 3

@@ -48,6 +48,7 @@ GROWING = (
     "times1.txt",
     "carlasc-report.json",
     "sequence.json",
+    "annotations.json",
 )
 
 
