@@ -404,9 +404,10 @@ class _ExportedFrom:
         for files in self._before.frames.values():
             for file in set(files.splitlines()) - kept:
                 path = inside / file
-                if path.is_file() and path.parent.resolve().is_relative_to(inside):
-                    path.unlink()
-                    with suppress(OSError):  # it is not empty
+                if path.parent.resolve().is_relative_to(inside):
+                    if path.is_file():  # a run that was killed may have made its folder only
+                        path.unlink()
+                    with suppress(OSError):  # it is not empty, or not there
                         path.parent.rmdir()
 
     def write(self) -> None:
