@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -75,26 +75,28 @@ class Clips:
             StorageError: the output or the scratch cannot be written.
         """
         sink = FolderSink(self.out)
-        todo = dict[str, str]()
-        for name in self.names:
-            done, state = sink.target.read(self._done(name)), self._state(name)
-            if done is None or state.encode() not in done:
-                todo[name] = state
-        for name, place in self._fetched(todo):
+        states = dict[str, str]()
+        for name, place in self._fetched(self._todo(sink, states)):
             if isinstance(place, CarlascError):
                 yield Failure(name, -1, str(place))
                 continue
             try:
-                result = self._convert(name, todo[name], place, sink, run)
+                result = self._convert(name, states[name], place, sink, run)
             except StorageError:
                 raise
             except (CarlascError, OSError) as error:
                 yield Failure(name, -1, str(error).replace(str(place), without_credentials(name)))
                 continue
-            if not result.failures:
-                about = {"clip": without_credentials(name), "state": todo[name]}
-                sink.target.put(self._done(name), to_json(about))
             yield result
+
+    def _todo(self, sink: FolderSink, states: dict[str, str]) -> Iterator[str]:
+        """Yield the clips that are not done in their state, and note the state of each. A clip is
+        looked at when its turn comes: the first one need not wait for requests about all others.
+        """
+        for name in self.names:
+            done, states[name] = sink.target.read(self._done(name)), self._state(name)
+            if done is None or states[name].encode() not in done:
+                yield name
 
     def _done(self, name: str) -> str:
         """Return the file that says that a clip is done with these arguments."""
@@ -102,17 +104,16 @@ class Clips:
 
     def _state(self, name: str) -> str:
         """Return the state of the files of a clip; empty if they are not there any more."""
-        url = self._place(name)
-        states = {} if is_url(url) else folder_states({"": Path(url)})
+        states = dict[str, str]()
         with suppress(CarlascError):
-            if is_url(url):
-                tree = RemoteTree(url)
-                if sizes := tree.sizes():  # a server may have no versions
-                    states = tree.states([*sizes]) | {"sizes": str(sizes)}
+            if not is_url(url := self._place(name)):
+                states = folder_states({"": Path(url)})
+            elif sizes := (tree := RemoteTree(url)).sizes():  # a server may have no versions
+                states = tree.states([*sizes]) | {"sizes": str(sizes)}
         return combined(sorted(states.items())) if states else ""
 
     def _convert(self, name: str, state: str, place: Path, sink: FolderSink, run: Run) -> Any:
-        given, record = {**self.arguments}, layout.record_file("clip")
+        given, record, done = {**self.arguments}, layout.record_file("clip"), self._done(name)
         name, writers, changed = without_credentials(name), list[FolderWriter](), False
         mine = f"{name}\n{state}".encode()
         for one in find_recordings(open_converter(given["name"], place, given["options"])):
@@ -126,8 +127,10 @@ class Clips:
             compare = "content" if changed else "never"
             given["layout"] = replace(given["layout"], compare_inputs=compare)
         result = self.convert(source=place, out=self.out, run=run, **given)
-        for writer in () if result.failures else writers:
-            writer.write_document(record, mine)
+        if not result.failures:
+            for writer in writers:
+                writer.write_document(record, mine)
+            sink.target.put(done, to_json({"clip": name, "state": state}))
         return result
 
     def _place(self, name: str) -> str:
@@ -140,7 +143,7 @@ class Clips:
         """
         with ThreadPoolExecutor(1) as pool:
             ahead = None
-            for name, later in pairwise([*names, ""]):
+            for name, later in pairwise(chain(names, [""])):
                 place, held = ahead.result() if ahead else self._fetch(name)
                 ahead = pool.submit(self._fetch, later) if later else None
                 try:

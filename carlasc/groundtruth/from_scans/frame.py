@@ -135,7 +135,7 @@ def merge_frame(
     if consensus is not None:
         steps.keep_returns(made, votes, consensus)
     above = _NO_VOXELS
-    if options.complete != "seen" and options.dynamic != "tube":
+    if consensus is not None and options.complete != "seen":
         above = steps.free_above(made)
     who = steps.actors(made.labels)
     if feed.must_find_ground:  # ground that was found had a class for the votes only
@@ -217,9 +217,9 @@ def find_above(solid: BoolArray, known: BoolArray, bodies: BoolArray, spec: Grid
     np.maximum.at(passed, group, _highest(known[columns] & ~solid[columns]))
 
     roofs = np.full((nx + 2, ny + 2), -1)
-    roofs[rows + 1, places + 1] = np.where(passed > top, top, -1)[group]
-    roof = sliding_window_view(roofs, (3, 3)).max(axis=(2, 3)).reshape(-1)
-    roof[columns] = roofs[rows + 1, places + 1]
+    roofs[rows + 1, places + 1] = own = np.where(passed > top, top, -1)[group]
+    roof = sliding_window_view(roofs, (3, 3)).max((2, 3)).reshape(-1)
+    roof[columns] = own
     chosen = np.flatnonzero(roof >= 0)
     over = np.arange(levels) - roof[chosen, None]
     above = (over > 0) & (over <= round(_ABOVE_M / float(spec.voxel_size[2])))
@@ -230,8 +230,7 @@ def find_above(solid: BoolArray, known: BoolArray, bodies: BoolArray, spec: Grid
 
 def _highest(voxels: BoolArray) -> IntArray:
     """Return the highest level of the voxels in each of (C, Z) columns, -1 without one."""
-    highest = voxels.shape[1] - 1 - np.argmax(voxels[:, ::-1], axis=1)
-    return np.where(voxels.any(axis=1), highest, -1)
+    return np.where(voxels, np.arange(voxels.shape[1]), -1).max(axis=1)
 
 
 @dataclass(frozen=True)
