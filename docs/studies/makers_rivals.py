@@ -347,6 +347,8 @@ RIVALS = {
                 (0.2, 0.4, 1),
                 (0.2, 0.2, 0),
                 (0.3, 0.3, 1),
+                (0.4, 0.2, 1),
+                (0.4, 0.4, 1),
             )
         ),
         module="dufomap",
@@ -362,6 +364,7 @@ RIVALS = {
             {"cleaners": {"visibility": _RANGE | {"min_see_through": 2}}, "ground": True},
             {"cleaners": {"visibility": _FINE}, "ground": True},
             {"cleaners": {"visibility": _FINE | {"max_surface_hits": 5}}, "ground": True},
+            {"cleaners": {"visibility": _FINE | {"max_surface_hits": 10}}, "ground": True},
             {"cleaners": {"scan_ratio": {}}},
             {"cleaners": {"scan_ratio": {"min_votes": 2}}},
         ),
@@ -379,6 +382,8 @@ RIVALS = {
                 (0.85, 0.45, 0.5),
                 (0.85, 0.4, 0.5),
                 (0.6, 0.45, 0.5),
+                (0.95, 0.45, 0.5),
+                (0.95, 0.4, 0.5),
             )
         ),
         module="pyoctomap",
@@ -397,6 +402,10 @@ RIVALS = {
                 (0.95, 0.05),
                 (0.8, 0.05),
                 (0.97, 0.1),
+                (0.97, 0.3),
+                (0.98, 0.2),
+                (0.99, 0.1),
+                (0.99, 0.3),
             )
         ),
     ),
