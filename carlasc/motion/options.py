@@ -26,8 +26,8 @@ class PoseOptions:
             if their calibration is missing.
         odometry_voxel_m: size of the voxels in which estimation thins points, in metres. None: by
             the distances of the points.
-        loops: what refining does at places that are met again. "auto": poses become consistent
-            there, if both passes then agree clearly better. "never": they may drift apart.
+        loops: close loops, when poses are refined. "auto": poses become consistent at places that
+            are met again, if both passes then agree clearly better. "never": they may drift apart.
 
     Raises:
         ArgumentError: an unknown value, or a size that is not positive.
