@@ -13,6 +13,7 @@ from .ground import ground_height as ground_height
 from .ground import ground_points as ground_points
 from .linking import Chain as Chain
 from .linking import Linker as Linker
+from .options import LoopMode as LoopMode
 from .options import MotionOptions as MotionOptions
 from .options import MotionSource as MotionSource
 from .options import PoseOptions as PoseOptions

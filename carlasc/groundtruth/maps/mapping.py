@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import shutil
 from collections.abc import Iterator
 from contextlib import closing
@@ -76,11 +78,16 @@ def write_map(
         points, bodies = drive.write(files), 0
         if files.trajectory is not None:
             drive.write_trajectory(files.trajectory)
+        if files.boxes is not None:
+            drive.write_boxes(files.boxes)
         if files.actors is not None and files.out is not None:
             bodies = drive.write_actors(files.actors, files.out.suffix.lower())
     return MapContent(points, len(drive.frames), bodies, drive.notes())
 
 
+_BOX_COLUMNS = (
+    "time number class x y z length width height heading vx vy vz confidence"  # metres, radians
+).split()
 _BLOCK = 10  # number of scans that a worker sums
 
 
@@ -174,6 +181,36 @@ class DriveMap:
         table = np.column_stack([sequence.times_of(self.frames), poses[:, :3, 3], turns])
         lines = (" ".join(f"{value:.9g}" for value in row) for row in table.tolist())
         write_atomic(path, "".join(f"{line}\n" for line in lines).encode())
+
+    def write_boxes(self, path: Path) -> None:
+        """Write the box of each moving actor at each scan, in order of actors, then of time."""
+        rows, names = list[dict[str, Any]](), self.inputs.metadata.classes.names
+        signs = (1, -1, 1) if self.inputs.metadata.axes == "left" else (1, 1, 1)
+        times = self.inputs.feed.sequence.times_of(self.frames).tolist()
+        for number, track in self.inputs.actors.tracks.items():
+            middle = (track.lower + track.upper) / 2
+            for frame, seconds in zip(self.frames, times, strict=True):
+                pose, velocity = track.pose(frame), track.velocity_at(frame)
+                if pose is None or velocity is None:
+                    continue
+                ahead = pose[:3, 0] * signs
+                values = {
+                    **dict(zip("xyz", transform_points(pose, middle) * signs, strict=True)),
+                    **dict(zip(("length", "width", "height"), track.size, strict=True)),
+                    "heading": np.arctan2(ahead[1], ahead[0]),
+                    **dict(zip(("vx", "vy", "vz"), velocity * signs, strict=True)),
+                    "confidence": track.confidence,
+                }
+                row = {"time": round(seconds, 6), "number": number, "class": names[track.label]}
+                rows.append(row | {name: round(float(v), 4) for name, v in values.items()})
+        if path.suffix.lower() == ".json":
+            write_atomic(path, to_json(rows))
+            return
+        text = io.StringIO()
+        table = csv.DictWriter(text, _BOX_COLUMNS, lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
+        write_atomic(path, text.getvalue().encode())
 
     def write_actors(self, folder: Path, ending: str) -> int:
         """Write the body of each actor, in its own frame, and its poses; return the number of
