@@ -26,7 +26,6 @@ from carlasc.converting.assembling import (
 from carlasc.converting.chosen import ChosenFrames
 from carlasc.converting.plans import (
     CONVERSION,
-    KISS_ICP,
     begin,
     plan_recording,
     sequence_path,
@@ -117,7 +116,7 @@ def follow(
         raise ArgumentError("level", expected="False while the drive grows", found="True")
     if not root.is_dir():
         raise MissingDataError(root, expected="a folder", found="nothing", advice="check the path")
-    poses = replace(poses, source=KISS_ICP)
+    poses = replace(poses, source="kiss-icp")
     look = _Folder(name, root, options, idle_s, say, wait)
     spread = Run(max(2, run.processes - 1))  # one process makes grids, even on one core
     with one_pool(spread) as pool:
@@ -171,11 +170,12 @@ class _Folder:
             for handle in fresh:
                 if before.get(handle.location) != now[handle.location]:
                     break  # it is new, or still being written
-                if waited >= _PAUSE_S:
-                    self.say(f"scans come again after {waited:.0f} s")
-                waited, self.last = 0.0, handle.location
+                self.last = handle.location
                 yield handle, None if times is None else float(times[handle.number])
-            waited = 0.0 if now and now != before else waited
+            if now and now != before:
+                if waited >= _PAUSE_S and self.last is not None:
+                    self.say(f"scans come again after {waited:g} s")
+                waited = 0.0
             before = now
             self.between()
             self.wait(_LOOK_S)

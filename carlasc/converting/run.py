@@ -313,9 +313,11 @@ class _ConvertedFrom:
         if self.plan.again:
             before, where = self._before, self.plan.writer.location
             conversion.remove_others(map(int, before.frames))
-            if conversion.changed or not before.own:
+            if before.whole == PROVISIONAL:
+                why = "they were provisional"
+            else:
                 why = changed_names(before.own, self.states or {}) if before.own else _UNKNOWN
-                why = "they were provisional" if before.whole == PROVISIONAL else why
+            if conversion.changed or why == _UNKNOWN:
                 self.notes.append(f"{where}: {made_again(conversion.changed, why)}")
         has_gaps = conversion.allow_gaps or self.plan.pose_source == KISS_ICP
         self._write(conversion.failed if has_gaps else ())

@@ -441,10 +441,11 @@ class InputCheck:
         }
         if self.stale:
             why = describe_changes(record.own, self._own)
-            if not why:
+            if self.is_provisional:
+                why = "they were provisional"
+            elif not why:
                 was_interrupted = "" in recorded.values()
                 why = "a run was interrupted" if was_interrupted else "what all scans share changed"
-                why = "they were provisional" if self.is_provisional else why
             self.notes.append(f"{self.writer.location}: {made_again(self.stale, why)}")
         if unknown := [frame for frame in sorted(existing) if recorded[frame] is None]:
             self._accept(unknown, agrees)
