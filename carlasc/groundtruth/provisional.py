@@ -19,12 +19,15 @@ from carlasc.storage.protocol import Sequence, SequenceWriter
 from carlasc.storage.resuming import check_grid
 
 
+_EVERY = 3  # of the scans of a window, every N-th one is merged: to find what moves takes time
+
+
 @dataclass(frozen=True)
 class ProvisionalFrame:
     """A frame of which the whole window exists. It is made in a worker.
 
-    Only the scans of its window show what moves, and poses are not refined, so that each grid takes
-    the same time, however long the drive is.
+    Every third scan of its window is merged, and shows what moves; poses are not refined. So each
+    grid takes the same short time, however long the drive is.
 
     Attributes:
         sequence: its sequence.
@@ -47,8 +50,9 @@ class ProvisionalFrame:
         """
         observe = cast(FromScans, self.plan.observe)
         first, last = observe.window
+        every = observe.stride if observe.stride > 1 else _EVERY
         others = set(self.sequence.frames("points").tolist())
-        others -= {*range(self.number + first, self.number + last + 1)}
+        others -= {self.number + i for i in range(first, last + 1) if i % every == 0}
         near, plan, writer = WithoutScans(self.sequence, others), self.plan, self.writer
         try:
             params = settings_of(ScanSequence(near, plan, observe), plan)
