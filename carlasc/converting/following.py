@@ -58,7 +58,7 @@ from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout as files
 from carlasc.storage.files import AnyPath
 from carlasc.storage.inputs import PROVISIONAL, MadeFrom
-from carlasc.storage.layout import place_of
+from carlasc.storage.layout import Metadata, place_of
 from carlasc.storage.opening import as_sink
 from carlasc.storage.protocol import Sink, Source
 
@@ -117,12 +117,15 @@ def follow(
     if not root.is_dir():
         raise MissingDataError(root, expected="a folder", found="nothing", advice="check the path")
     poses = replace(poses, source="kiss-icp")
-    look = _Folder(name, root, options, idle_s, say, wait)
-    spread = Run(max(2, run.processes - 1))  # one process makes grids, even on one core
+    converter = open_converter(name, root, options)
+    look = _Folder(converter, idle_s, say, wait)
+    spread = Run(max(2, run.processes))  # one process makes grids, even on one core
     with one_pool(spread) as pool:
         makers = cast(Executor, pool.executor)
-        drive = _Drive(look, sink, layout, poses, grids, makers, max(1, run.processes - 1))
-        look.between = drive.write
+        documents = describe(converter, name, layout)
+        drive = _Drive(
+            look, converter, sink, layout, documents, poses, grids, makers, spread.processes - 1
+        )
         try:
             drive.run()
         except KeyboardInterrupt:
@@ -134,26 +137,19 @@ def follow(
 class _Folder:
     """A folder that grows, and the converter that reads it."""
 
-    name: str | type[Converter]
-    root: Path
-    options: Mapping[str, Any] | None
+    converter: Converter
     idle_s: float | None
     say: Callable[[str], None]
     wait: Callable[[float], None]
-    between: Callable[[], None] = lambda: None
     last: str | None = None
 
-    def open(self) -> Converter:
-        """Return the converter."""
-        return open_converter(self.name, self.root, self.options)
-
-    def scans(self) -> Iterator[tuple[FrameHandle, float | None]]:
-        """Yield each scan when it is whole, and its time; between two looks, call `between`."""
+    def scans(self) -> Iterator[tuple[FrameHandle, float | None] | None]:
+        """Yield each scan when it is whole, and its time; None after each look."""
         problem, waited, before = "", 0.0, dict[str, tuple[int, int]]()
         while self.idle_s is None or waited < self.idle_s:
             fresh, times = list[FrameHandle](), None
             try:
-                (recording, *others) = find_recordings(self.open())
+                (recording, *others) = find_recordings(self.converter)
                 if others:
                     raise ArgumentError(
                         "source", expected="one growing recording", found=str(1 + len(others))
@@ -177,7 +173,7 @@ class _Folder:
                     self.say(f"scans come again after {waited:g} s")
                 waited = 0.0
             before = now
-            self.between()
+            yield None
             self.wait(_LOOK_S)
             waited += _LOOK_S
             if waited - _LOOK_S < _PAUSE_S <= waited and self.last is not None:
@@ -199,8 +195,10 @@ class _Drive:
 
     Attributes:
         folder: the growing folder.
+        converter: what reads it.
         sink: the output.
         layout: how sequences are written.
+        metadata: the entries of carlasc.json that do not depend on scans.
         poses: how poses are estimated.
         grids: the grids; None makes none.
         pool: processes that make grids.
@@ -210,8 +208,10 @@ class _Drive:
     """
 
     folder: _Folder
+    converter: Converter
     sink: Sink
     layout: LayoutOptions
+    metadata: Metadata
     poses: PoseOptions
     grids: GridOptions | None
     pool: Executor
@@ -228,7 +228,6 @@ class _Drive:
 
     def run(self) -> None:
         """Take scans, estimate their poses, and write them, until the drive ends."""
-        self.converter = self.folder.open()
         self.target = self.layout.of(self.converter)
         scans = self._usable()
         if (first := next(scans, None)) is None:
@@ -243,8 +242,11 @@ class _Drive:
 
     def _usable(self) -> Iterator[tuple[int, odometry.UsableScan]]:
         """Yield the number and the points of each scan that can be read."""
-        for handle, seconds in self.folder.scans():
-            number = len(self.arrived)
+        for found in self.folder.scans():
+            if found is None:
+                self.write()
+                continue
+            (handle, seconds), number = found, len(self.arrived)
             if not number:
                 self._begin()
             at_s = number * files.FRAME_PERIOD_S if seconds is None else seconds
@@ -282,7 +284,7 @@ class _Drive:
         self._mark(before.frames)
         plan.writer.remove_document(files.METADATA)
         plan.again = plan.is_same = True
-        begin(plan, self.target, describe(self.converter, self.folder.name, self.layout))
+        begin(plan, self.target, self.metadata)
         plan.times = plan.times[:0]
 
     def _mark(self, frames: Mapping[str, str]) -> None:
@@ -294,7 +296,9 @@ class _Drive:
         if (known := len(self.lines)) > self._written:
             plan, times = self.plan, self.plan.times[:known]
             poses = np.stack(self.lines)
-            self._note_jump(poses, times)
+            new = slice(max(self._written - 1, 0), known)
+            if jump := describe_jumps(np.arange(known)[new], poses[new], times[new]):
+                self.folder.say(f"the sensor jumped: {jump}")
             stored = mirror_poses(poses) if self.target.mirrored else poses
             earlier = MadeFrom.read(plan.writer, CONVERSION).frames
             self._mark(earlier | dict.fromkeys(map(str, range(self._written, known)), "done"))
@@ -323,13 +327,6 @@ class _Drive:
         vehicle = poses[near] @ invert(self.plan.recording.vehicle_T_scan)
         return VehicleMotion(Trajectory(vehicle, times), float(self.plan.times[number]))
 
-    def _note_jump(self, poses: FloatArray, times: FloatArray) -> None:
-        """Say if the sensor jumped between the scans that are about to be written."""
-        new = slice(max(self._written - 1, 0), None)
-        numbers = np.arange(len(poses))[new]
-        if jump := describe_jumps(numbers, poses[new], times[new]):
-            self.folder.say(f"the sensor jumped: {jump}")
-
     def _make_grids(self, grids: GridOptions) -> None:
         """Take grids that are made, and begin that of the newest frame with a whole window."""
         observe = grids.observe if isinstance(grids.observe, FromScans) else FromScans()
@@ -344,8 +341,6 @@ class _Drive:
             return
         path, source = sequence_path(self.plan.recording), self.sink.source()
         sequence = source.sequences_in([place_of(path)])[path]
-        if number not in sequence.frames("points"):
-            return  # it could not be read
         if self._grid is None:
             self._grid = self._plan(grids, source)
         self._next = number + 1

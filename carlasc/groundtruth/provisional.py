@@ -18,7 +18,6 @@ from carlasc.storage.inputs import PROVISIONAL, MadeFrom
 from carlasc.storage.protocol import Sequence, SequenceWriter
 from carlasc.storage.resuming import check_grid
 
-
 _EVERY = 3  # of the scans of a window, every N-th one is merged: to find what moves takes time
 
 
