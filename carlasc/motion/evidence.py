@@ -48,8 +48,8 @@ HORIZON_S = 5.0  # fact: horizon
 _OFFSETS_S = (0.3, 0.5, 0.8, 1.2, 1.6, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0)
 _AGREEING = 2  # least number of scans that saw a place free
 _IN_A_ROW = 4  # the same, if all scans on one side in time, from the farthest inwards, saw it free
-# Every third scan is looked up first. A place that so many scans saw occupied, and none saw free, is
-# static.
+# Every third scan is looked up first. A place that so many scans saw occupied, and none saw free,
+# is static.
 _EVERY, _SURE = 3, 4
 _CELL_M = 0.35  # points of one object are in neighbouring cells of this size, seen from above
 _MIN_POINTS = 3  # smaller clusters are noise
@@ -235,10 +235,7 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     groups = _clusters(world, kind, moved, left, static)
     freed = tuple(int((moved | left)[group].sum()) for group in groups)
     clusters = [candidates[group] for group in groups]
-    points = [
-        transform_points(scan.world_T_sensor, scan.points[members].astype(np.float64))
-        for members in clusters
-    ]
+    points = [world[group] for group in groups]
     classes = [
         0 if scan.labels is None else int(np.bincount(scan.labels[own]).argmax())
         for own in clusters
@@ -256,6 +253,8 @@ def cells_around(points: AnyFloatArray) -> IntArray:
     indices of a flat array of `OWN_CELLS` along each axis.
     """
     near = points[(np.abs(points) < OWN_REACH_M).all(axis=1)]
+    if not len(near):
+        return np.empty(0, np.int64)
     cells = np.floor(near / OWN_CELL_M).astype(np.int64) + OWN_CELLS // 2
     return np.unique(np.ravel_multi_index(tuple(cells.T), (OWN_CELLS,) * 3, mode="clip"))
 

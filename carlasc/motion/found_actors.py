@@ -247,31 +247,6 @@ class _ActorChain:
         least = np.take_along_axis(slopes, np.abs(slopes).argmin(axis=0)[None], axis=0)[0]
         return np.where(np.abs(slopes).max(axis=0) > 0, (least + slopes[1]) / 2, 0.0)
 
-    def cost(self, link: _Link) -> float | None:
-        """Return how badly an observation continues the chain; None if it cannot."""
-        last, velocity = self.last, self.velocity
-        if last.segment.label != link.segment.label:
-            return None
-        elapsed = link.seconds - last.seconds
-        shift = np.zeros(3) if velocity is None else velocity * elapsed
-        gap = np.maximum(
-            np.maximum(last.lower + shift - link.upper, link.lower - last.upper - shift), 0.0
-        )
-        offset = link.middle - last.middle - shift
-        reach = _REACH_M + (min(_MAX_SPEED_M_S * elapsed, 4.0) if velocity is None else 0.0)
-        if (
-            np.linalg.norm(gap[:2], axis=0) > reach
-            or abs(gap[2]) > _REACH_M
-            or np.linalg.norm(offset[:2], axis=0) > 3 * reach + 2.0
-        ):
-            return None
-        sizes = np.abs((link.upper - link.lower) - (last.upper - last.lower))
-        return float(
-            np.linalg.norm(gap, axis=0)
-            + 0.3 * np.linalg.norm(offset[:2], axis=0)
-            + 0.2 * sizes.sum()
-        )
-
     def covers(self, link: _Link) -> bool:
         """Return whether an observation is inside the place that is expected of the next one."""
         velocity = self.velocity
@@ -410,12 +385,20 @@ def _join_parts(links: list[_Link], deformable: Collection[int]) -> list[_Link]:
     Rays that meet a side at a grazing angle are far apart, and split it.
     """
     joined = list(links)
+    bounds = [[*link.lower.tolist(), *link.upper.tolist()] for link in links]
     i = 0
     while i < len(joined):
         j = i + 1
         while j < len(joined):
-            if _are_parts(joined[i], joined[j], deformable):
+            near = all(
+                max(bounds[i][axis] - bounds[j][axis + 3], bounds[j][axis] - bounds[i][axis + 3])
+                <= _PARTS_M
+                for axis in range(3)
+            )
+            if near and _are_parts(joined[i], joined[j], deformable):
                 joined[i] = joined[i].joined(joined.pop(j))
+                del bounds[j]
+                bounds[i] = [*joined[i].lower.tolist(), *joined[i].upper.tolist()]
                 j = i + 1
             else:
                 j += 1
@@ -425,10 +408,7 @@ def _join_parts(links: list[_Link], deformable: Collection[int]) -> list[_Link]:
 
 def _are_parts(one: _Link, other: _Link, deformable: Collection[int]) -> bool:
     label = one.segment.label
-    if (
-        label != other.segment.label
-        or (np.maximum(one.lower - other.upper, other.lower - one.upper) > _PARTS_M).any()
-    ):
+    if label != other.segment.label:
         return False
     if label in deformable or (not (label and deformable) and one.is_small and other.is_small):
         return False
@@ -445,14 +425,7 @@ def _link(
     links = _join_parts(
         [_Link.of(evidence, index) for index in range(len(evidence.clusters))], deformable
     )
-    costs = []
-    ends = np.array([chain.last.middle for chain in alive]).reshape(-1, 3)
-    for i, link in enumerate(links):
-        for j in np.flatnonzero(np.abs(ends - link.middle).max(axis=1) < _FAR_M).tolist():
-            cost = alive[j].cost(link)
-            if cost is not None:
-                costs.append((cost, i, j))
-    taken = best_pairs(costs)
+    taken = best_pairs(_costs(links, alive) if alive else [])
     extra = {
         i: j
         for i in range(len(links))
@@ -467,3 +440,33 @@ def _link(
     for i, j in taken.items():
         alive[j].append(links[i])
     alive.extend(fresh)
+
+
+def _costs(links: list[_Link], alive: list[_ActorChain]) -> list[tuple[float, int, int]]:
+    """Return how badly each observation continues each chain that it can continue, with the numbers
+    of both.
+    """
+    ends = [chain.last for chain in alive]
+    label = np.array([end.segment.label for end in ends])
+    seconds = np.array([end.seconds for end in ends])
+    lower, upper = (np.stack([getattr(end, name) for end in ends]) for name in ("lower", "upper"))
+    middle, size = (lower + upper) / 2, upper - lower
+    fresh = np.array([chain.velocity is None for chain in alive])
+    velocity = np.stack(
+        [np.zeros(3) if chain.velocity is None else chain.velocity for chain in alive]
+    )
+    costs = list[tuple[float, int, int]]()
+    for i, link in enumerate(links):
+        elapsed = link.seconds - seconds
+        shift = velocity * elapsed[:, None]
+        gap = np.maximum(np.maximum(lower + shift - link.upper, link.lower - upper - shift), 0.0)
+        offset = link.middle - middle - shift
+        reach = _REACH_M + np.where(fresh, np.minimum(_MAX_SPEED_M_S * elapsed, 4.0), 0.0)
+        aside = np.linalg.norm(offset[:, :2], axis=1)
+        can = (label == link.segment.label) & (np.abs(middle - link.middle).max(axis=1) < _FAR_M)
+        can &= (np.linalg.norm(gap[:, :2], axis=1) <= reach) & (gap[:, 2] <= _REACH_M)
+        can &= aside <= 3 * reach + 2.0
+        sizes = np.abs((link.upper - link.lower) - size).sum(axis=1)
+        cost = np.linalg.norm(gap, axis=1) + 0.3 * aside + 0.2 * sizes
+        costs += [(float(cost[j]), i, j) for j in np.flatnonzero(can).tolist()]
+    return costs
