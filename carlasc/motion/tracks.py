@@ -348,7 +348,7 @@ class MovingActors:
             own[near] |= ((points[near] >= lower) & (points[near] <= upper)).all(axis=1)
         return own
 
-    def to_bytes(self, key: str) -> bytes:
+    def to_bytes(self, key: str, *, is_compressed: bool = True) -> bytes:
         """Return the content of a file with these actors. `key` is a digest of their source."""
         table, poses, velocities, bounds, members, frames, surfaces = [], [], [], [], [], [], []
         for number, track in self.tracks.items():
@@ -396,7 +396,8 @@ class MovingActors:
             "own": np.array(self.own, np.float64).reshape(-1, 6),
         }
         buffer = io.BytesIO()
-        np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+        save = np.savez_compressed if is_compressed else np.savez
+        save(buffer, **arrays)  # type: ignore[arg-type]
         return buffer.getvalue()
 
     @classmethod

@@ -1,221 +1,50 @@
 """Who makes ground truth how well, and does an audit by held-out rays alone say so?
 
-`python docs/studies/makers.py`.
+`python docs/studies/makers.py [WORK]`; `--sweep` compares the settings of each rival on drives
+apart (seeds 51 to 54), and WORK keeps drives and results.
 
 Simulated drives of moving actors. Every 5th scan is left out of every maker, and the makers' grids
-at the frames of some of these scans are scored twice: by the held-out rays (the formula S of
-docs/studies/makers.md) and by a reference of 40 sensors (truth: the mean of the IoU of occupied
-space and of Vehicle). Prints a table with intervals over drives, the times, and Kendall's tau of
-both orders, by drive.
+at the frames of some of these scans are scored three times: by the held-out rays (the formula S of
+docs/studies/makers.md), by the depth along these rays, and by a reference of 40 sensors (truth: the
+mean of the IoU of occupied space and of Vehicle). Prints a table with intervals over drives, the
+times, and Kendall's tau of the orders, by drive.
 
-DUFOMap, dynamic-object-removal and OctoMap take part if `dufomap`, `dynamic_object_removal` and
-`pyoctomap` can be imported. SurroundOcc's recipe is written from its paper: the points of static
-things are stacked by the poses, those of each object in its own box; voxels with a point are
-occupied. Its completion by Poisson's method is left out; boxes are the tracks of the instances.
+Other programs take part if they are installed: `pip install dufomap dynamic-object-removal
+pyoctomap`. SurroundOcc's recipe is written from its paper: the points of static things are stacked
+by the poses, those of each object in its own box; voxels with a point are occupied. Its completion
+by Poisson's method is left out; boxes are the tracks of the instances.
 """
 
 from __future__ import annotations
 
-import importlib
+import json
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Mapping
+from importlib.metadata import version
 from importlib.util import find_spec
 from itertools import combinations
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import study
 from carlasc_recorders import SimulatedCapture, TownDrive
+from makers_rivals import JUDGED, RIVALS, SPEC, WINDOW, Drive, Rival, Settings
 
 import carlasc
-from carlasc import FromScans, Grid, GridSpec, Run, Voting
+from carlasc import Grid, Run
 from carlasc.captures import Lidar
-from carlasc.core.frames import FrameRange
 from carlasc.core.geometry import invert, transform_points
-from carlasc.core.grids import most_frequent
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth import Observation, count_votes
-from carlasc.groundtruth.from_scans.feed import ScanFeed, WithoutScans
-from carlasc.groundtruth.from_scans.frame import merge_frame
-from carlasc.groundtruth.from_scans.motion_pass import find_actors
-from carlasc.groundtruth.inputs import GridPlan
+from carlasc.inspection.heldout_scores import depth_errors
 from carlasc.metrics import score_truth
-from carlasc.motion import MotionOptions
-from carlasc.storage.views import SequenceView
 
-SEEDS = {"town": range(61, 66)}  # the formula was chosen on 51 to 54
-FRAMES, FIRST, EVERY, WINDOW, SENSORS = 41, 30, 5, (-10, 10), 40
-JUDGED = (12, 17, 22, 27)
-SPEC, LIDAR = GridSpec.published(), Lidar(channels=32, points=30_000)
-Maker = Callable[["Drive"], dict[int, Grid]]
-
-
-@dataclass
-class Drive:
-    """A drive without the scans that are left out."""
-
-    whole: carlasc.storage.Sequence
-    hidden: tuple[int, ...]
-
-    @property
-    def frames(self) -> list[int]:
-        """The frames of the drive."""
-        return self.whole.frames("points").tolist()
-
-    @property
-    def scans(self) -> WithoutScans:
-        """The scans that makers may use."""
-        return WithoutScans(self.whole, self.hidden)
-
-    def window(self, frame: int) -> list[int]:
-        """Return the frames whose scans a maker may merge into a frame."""
-        return [
-            f
-            for f in range(frame + WINDOW[0], frame + WINDOW[1] + 1)
-            if f in self.frames and f not in self.hidden
-        ]
-
-
-class Cleaned(SequenceView):
-    """Scans without the points that a filter took away."""
-
-    def __init__(self, whole: carlasc.storage.Sequence, keep: dict[int, np.ndarray]) -> None:
-        super().__init__(whole)
-        self.keep = keep
-
-    def read(self, field: str, frame: int) -> np.ndarray:
-        """Read a field of a frame, without the points that were taken away."""
-        values = self.whole.read(field, frame)
-        per_point = field in ("points", "labels", "flow", "instances") and frame in self.keep
-        return values[self.keep[frame]] if per_point else values
-
-
-def merged(observe: FromScans) -> Maker:
-    """Return our maker with some options."""
-    return lambda drive: merge(drive.scans, observe)
-
-
-def merge(scans: carlasc.storage.Sequence, observe: FromScans) -> dict[int, Grid]:
-    """Return our grids at the judged frames."""
-    feed = ScanFeed(scans, observe)
-    plan = GridPlan(SPEC, "evaluation", observe, Voting(), FrameRange.of(None))
-    actors = find_actors(feed)
-    return {
-        f: merge_frame(plan, feed, actors, f, feed.reaching(f, SPEC)).grid
-        for f in study.few(JUDGED)
-    }
-
-
-def in_world(drive: Drive) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Return (N, 3) points and (4, 4) pose of each scan that is left, by frame."""
-    poses = {f: drive.whole.read_pose(f) for f in drive.frames if f not in drive.hidden}
-    return {
-        f: (transform_points(pose, drive.whole.scan(f, ()).points), pose)
-        for f, pose in poses.items()
-    }
-
-
-def dufomap(drive: Drive) -> dict[int, Grid]:
-    """Return `tube` after DUFOMap, with the parameters of its authors."""
-    cloud, scans = (
-        importlib.import_module("dufomap").dufomap(0.1, 0.2, 1, num_threads=1),
-        in_world(drive),
-    )
-    for points, pose in scans.values():
-        cloud.run(points.astype(np.float32), pose, cloud_transform=False)
-    cloud.oncePropagateCluster(if_propagate=True, if_cluster=False)
-    keep = {
-        f: np.asarray(cloud.segment(points.astype(np.float32), pose, cloud_transform=False)) == 0
-        for f, (points, pose) in scans.items()
-    }
-    return merge(Cleaned(drive.scans, keep), FromScans(WINDOW, dynamic="tube"))
-
-
-def removal(drive: Drive) -> dict[int, Grid]:
-    """Return `tube` after dynamic-object-removal's cleaner of maps."""
-    scans = in_world(drive)
-    points = np.concatenate([p for p, _ in scans.values()])
-    clean = importlib.import_module("dynamic_object_removal").clean_map_by_fusion
-    keep = clean(points, [(p, pose[:3, 3]) for p, pose in scans.values()])[1]
-    parts = np.split(keep, np.cumsum([len(p) for p, _ in scans.values()])[:-1])
-    return merge(
-        Cleaned(drive.scans, dict(zip(scans, parts, strict=True))),
-        FromScans(WINDOW, dynamic="tube"),
-    )
-
-
-def octomap(drive: Drive) -> dict[int, Grid]:
-    """Return the occupancy of OctoMap, with the most frequent class of the points in each voxel."""
-    library, scans, grids = importlib.import_module("pyoctomap"), in_world(drive), {}
-    for frame in study.few(JUDGED):
-        tree, grid_T_world = (
-            library.OcTree(float(SPEC.voxel_size[0])),
-            invert(drive.whole.read_pose(frame)),
-        )
-        for other in drive.window(frame):
-            points, pose = scans[other]
-            local = transform_points(grid_T_world, points) - np.array(SPEC.lower)
-            tree.insertPointCloud(local, (grid_T_world @ pose)[:3, 3] - np.array(SPEC.lower))
-        nodes = [
-            tree.search(center) for center in SPEC.centers().reshape(-1, 3) - np.array(SPEC.lower)
-        ]
-        known = np.array([node is not None for node in nodes])
-        occupied = np.array([node is not None and tree.isNodeOccupied(node) for node in nodes])
-        labels = classes_in(drive, frame, {f: scans[f][0] for f in drive.window(frame)})
-        labels = np.where(occupied, np.where(labels > 0, labels, CARLA.geometry_id), 0)
-        grids[frame] = Grid(
-            SPEC, labels.reshape(SPEC.size).astype(np.uint8), known.reshape(SPEC.size).astype(float)
-        )
-    return grids
-
-
-def surroundocc(drive: Drive) -> dict[int, Grid]:
-    """Return stacked points, those of objects in their boxes."""
-    scans, grids = in_world(drive), {}
-    tracks = find_actors(
-        ScanFeed(drive.scans, FromScans(motion=MotionOptions("instances")))
-    ).tracks.values()
-    for frame in study.few(JUDGED):
-        placed = {}
-        for other in drive.window(frame):
-            points = scans[other][0].copy()
-            for track in tracks:
-                own, then, now = track.members.get(other, ()), track.pose(other), track.pose(frame)
-                if len(own) and then is not None:
-                    points[own] = (
-                        np.nan if now is None else transform_points(now @ invert(then), points[own])
-                    )
-            placed[other] = points
-        labels = classes_in(drive, frame, placed).reshape(SPEC.size)
-        grids[frame] = Grid(SPEC, labels.astype(np.uint8), np.ones(SPEC.size))
-    return grids
-
-
-def classes_in(drive: Drive, frame: int, placed: dict[int, np.ndarray]) -> np.ndarray:
-    """Return (V,) the most frequent class of the points in each voxel of a frame; 0 where there is
-    none.
-    """
-    grid_T_world = invert(drive.whole.read_pose(frame))
-    voxels = np.concatenate(
-        [SPEC.flat_index(transform_points(grid_T_world, points)) for points in placed.values()]
-    )
-    labels = np.concatenate([drive.whole.read("labels", f) for f in placed])
-    found = np.zeros(SPEC.num_voxels, np.int64)
-    cells, kinds = most_frequent(voxels[voxels >= 0], labels[voxels >= 0])
-    found[cells] = kinds
-    return found
-
-
-MAKERS: dict[str, tuple[str | None, Maker]] = {  # name -> (module that it needs, maker)
-    "tube": (None, merged(FromScans(WINDOW, dynamic="tube"))),
-    "DUFOMap, tube": ("dufomap", dufomap),
-    "dynamic-object-removal, tube": ("dynamic_object_removal", removal),
-    "OctoMap": ("pyoctomap", octomap),
-    "SurroundOcc's recipe": (None, surroundocc),
-    "ours, flow": (None, merged(FromScans(WINDOW, motion=MotionOptions("flow")))),
-    "ours, instances": (None, merged(FromScans(WINDOW, motion=MotionOptions("instances")))),
-    "ours, free space": (None, merged(FromScans(WINDOW, motion=MotionOptions("evidence")))),
-}
+SEEDS = {"town": range(61, 71)}
+APART = range(51, 55)  # on which the formula and the settings were chosen
+FRAMES, FIRST, EVERY, SENSORS = 41, 30, 5, 40
+LIDAR = Lidar(channels=32, points=30_000)
+MEASURES = ("S", "depth_m", "truth", "all", "seconds")
 
 
 def held_out(drive: Drive, grids: dict[int, Grid]) -> float:
@@ -262,12 +91,38 @@ def evidence(drive: Drive, frame: int, other: int) -> Grid:
     ).to_grid()
 
 
-def truth_of(grids: dict[int, Grid], references: dict[int, Grid]) -> float:
+def depth_error(drive: Drive, grids: dict[int, Grid]) -> float:
+    """Return the mean of the depth errors of the frames' own scans, which are held out, and of
+    static returns of the other held-out scans, in metres.
+    """
+    found = []
+    for frame, grid in grids.items():
+        for other in (frame, *others(drive, frame)):
+            scan = drive.whole.scan(other, ("labels",))
+            labels = study.labels_of(scan)
+            keep = labels > 0
+            if other != frame:
+                keep &= ~np.isin(labels, sorted(CARLA.movable))
+            motion = invert(drive.whole.read_pose(frame)) @ drive.whole.read_pose(other)
+            points = transform_points(motion, scan.points[keep])
+            points = points[SPEC.flat_index(points) >= 0]
+            origins = np.broadcast_to(motion[:3, 3], points.shape)
+            occupied = grid.known & (grid.labels > 0)
+            found.append(depth_errors(occupied, SPEC, origins, points).mean())
+    return float(np.mean(found))
+
+
+def truth_of(grids: Mapping[int, Grid], references: Mapping[int, Grid]) -> float:
     """Return the mean of the IoU of occupied space and of vehicles."""
     total = carlasc.metrics.ConfusionMatrix(CARLA.num_channels)
     for frame, grid in grids.items():
         total += score_truth(grid, references[frame], CARLA.num_channels).matrix
     return (total.completeness().iou + float(total.iou[CARLA.id_of("Vehicle")])) / 2
+
+
+def everywhere(grid: Grid) -> Grid:
+    """Return a grid whose unknown voxels are free, so that what is occupied there is missed."""
+    return Grid(grid.spec, np.where(grid.known, grid.labels, 0), np.ones(grid.spec.size))
 
 
 def kendall(one: list[float], other: list[float]) -> float:
@@ -282,49 +137,93 @@ def kendall(one: list[float], other: list[float]) -> float:
 
 def main() -> None:
     """Make, score and print."""
-    clock, rows = study.Clock(), {}
-    usable = {
-        name: maker
-        for name, (module, maker) in MAKERS.items()
-        if module is None or find_spec(module)
-    }
-    print("not installed:", ", ".join(name for name in MAKERS if name not in usable) or "nothing")
-    with study.begin(study.options(__doc__, SEEDS)) as given:
-        for seed in study.few(given.town):
+    parser = study.options(__doc__, SEEDS)
+    parser.add_argument("--sweep", action="store_true", help="compare settings on drives apart")
+    parser.add_argument("--makers", nargs="+", default=list(RIVALS), help="only these")
+    clock, found = study.Clock(), dict[str, list[dict[str, float]]]()
+    with study.begin(parser) as given:
+        usable = {
+            name: rival
+            for name, rival in RIVALS.items()
+            if name in given.makers and (rival.module is None or find_spec(rival.module))
+        }
+        missing = [name for name in given.makers if name not in usable]
+        print("not installed:", ", ".join(missing) or "nothing")
+        for seed in study.few(APART if given.sweep else given.town):
             place = given.work / f"town{seed}"
-            lidar = Lidar(channels=32, points=4_000) if study.is_tiny() else LIDAR
-            capture = SimulatedCapture(
-                count=18 if study.is_tiny() else FRAMES,
-                first_frame=FIRST,
-                sensors=1,
-                seed=seed,
-                traffic="heavy",
-                lidar=lidar,
-                bev=False,
-            )
-            carlasc.regrid(capture, SPEC, place, run=Run(workers=1))
-            whole = next(iter(carlasc.open(place).values()))
-            drive = Drive(
-                whole, tuple(f for f in whole.frames("points").tolist() if f % EVERY == EVERY // 2)
-            )
-            made, seconds = {}, {}
-            for name, maker in usable.items():
-                start = time.process_time()
-                made[name] = maker(drive)
-                seconds[name] = (time.process_time() - start) / len(made[name])
+            drive, references = record(seed, place)
+            for name, rival in usable.items():
+                for row in rows_of(rival, whole=given.sweep):
+                    scores = measure(rival, rival.settings[row], drive, references, place)
+                    found.setdefault(title(name, rival, row), []).append(scores)
                 clock(f"seed {seed}: {name}")
-            references = see(TownDrive(seed, "heavy", lidar))
-            scores = {name: held_out(drive, grids) for name, grids in made.items()}
-            truths = {name: truth_of(grids, references) for name, grids in made.items()}
-            rows[seed] = (scores, truths, seconds)
-            clock(f"seed {seed}")
-    show(rows)
+    show(found, usable)
 
 
-def see(town: TownDrive) -> dict[int, Grid]:
-    """Return what other sensors see at the judged frames."""
+def rows_of(rival: Rival, *, whole: bool) -> list[int]:
+    """Return the places of the settings to measure: all, or the advised and the best ones."""
+    return study.few(range(len(rival.settings)) if whole else sorted({0, rival.best}))
+
+
+def title(name: str, rival: Rival, row: int) -> str:
+    """Return the name of a row."""
+    if len(rival.settings) == 1:
+        return name
+    advised = row == 0 and rival.module is not None
+    kinds = ["advised"] * advised + ["best of a sweep"] * (row == rival.best)
+    return f"{name}; {' and '.join(kinds) or json.dumps(rival.settings[row])}"
+
+
+def record(seed: int, place: Path) -> tuple[Drive, dict[int, Grid]]:
+    """Return a drive, and what other sensors see at its judged frames."""
+    lidar = Lidar(channels=32, points=4_000) if study.is_tiny() else LIDAR
+    capture = SimulatedCapture(
+        count=18 if study.is_tiny() else FRAMES,
+        first_frame=FIRST,
+        sensors=1,
+        seed=seed,
+        traffic="heavy",
+        lidar=lidar,
+        bev=False,
+    )
+    carlasc.regrid(capture, SPEC, place, run=Run(workers=1))
+    whole = next(iter(carlasc.open(place).values()))
+    hidden = tuple(f for f in whole.frames("points").tolist() if f % EVERY == EVERY // 2)
+    return Drive(whole, hidden), see(TownDrive(seed, "heavy", lidar), place)
+
+
+def measure(
+    rival: Rival,
+    settings: Settings,
+    drive: Drive,
+    references: Mapping[int, Grid],
+    place: Path,
+) -> dict[str, float]:
+    """Return the scores of a maker on a drive; `place` keeps them."""
+    name = f"{rival.make.__name__} {json.dumps(settings)} {version(rival.module or 'carlasc')}"
+    kept, known = place / "makers.json", dict[str, Any]()
+    if kept.exists():
+        known = json.loads(kept.read_text())
+    if name not in known:
+        start = time.process_time()
+        grids = rival.make(drive, settings)
+        seconds = (time.process_time() - start) / len(grids)
+        scores = (held_out(drive, grids), depth_error(drive, grids), truth_of(grids, references))
+        whole = truth_of({f: everywhere(grid) for f, grid in grids.items()}, references)
+        known[name] = dict(zip(MEASURES, (*scores, whole, seconds), strict=True))
+        kept.write_text(json.dumps(known, indent=1))
+    return dict(known[name])
+
+
+def see(town: TownDrive, place: Path) -> dict[int, Grid]:
+    """Return what other sensors see at the judged frames; `place` keeps it."""
     references = {}
     for frame in study.few(JUDGED):
+        kept = place / f"reference{frame}.npz"
+        if kept.exists():
+            with np.load(kept) as arrays:
+                references[frame] = Grid(SPEC, arrays["labels"], arrays["known"].astype(float))
+            continue
         grid_T_world = invert(town.sensor_poses(FIRST + frame, 1)[0])
         seen = town.reference_observations(FIRST + frame, 3 if study.is_tiny() else SENSORS)
         observed = [
@@ -332,27 +231,31 @@ def see(town: TownDrive) -> dict[int, Grid]:
             for r in seen
         ]
         references[frame] = count_votes(observed, SPEC, CARLA).to_grid()
+        np.savez(kept, labels=references[frame].labels, known=references[frame].known)
     return references
 
 
-def show(rows: dict[int, tuple[dict[str, float], dict[str, float], dict[str, float]]]) -> None:
-    """Print S, truth and seconds of each maker over drives, and the agreement of the orders of S
-    and truth.
+def show(found: dict[str, list[dict[str, float]]], usable: Mapping[str, Rival]) -> None:
+    """Print the measures of each maker over drives, the best in truth first, and how well the
+    orders of S and of the depth agree with that of truth.
     """
-    print("\n| maker | S | truth | CPU s per frame |\n|---|---:|---:|---:|")
-    for name in next(iter(rows.values()))[0]:
-        scores, truths, seconds = ([row[part][name] for row in rows.values()] for part in range(3))
-        print(
-            f"| {name} | {study.interval(scores, '.3f')} | {study.interval(truths, '.3f')} | "
-            f"{np.mean(seconds):.2f} |"
+    print("\n| maker | told | truth | all | S | depth error, m | CPU time per frame |")
+    print("|---|---|---:|---:|---:|---:|---:|")
+    means = {name: np.mean([d["truth"] for d in drives]) for name, drives in found.items()}
+    for name in sorted(found, key=lambda one: -means[one]):
+        truth, whole, score, depth = (
+            study.interval([drive[key] for drive in found[name]], ".3f")
+            for key in ("truth", "all", "S", "depth_m")
         )
-    taus = [
-        kendall(list(scores.values()), list(truths.values())) for scores, truths, _ in rows.values()
-    ]
-    print(
-        f"\nKendall's tau: {np.mean(taus):.2f} in the mean of {len(taus)} drives ({min(taus):.2f} "
-        f"to {max(taus):.2f})"
-    )
+        seconds = np.mean([drive["seconds"] for drive in found[name]])
+        told = usable[name.split(";")[0]].told
+        print(f"| {name} | {told} | {truth} | {whole} | {score} | {depth} | {seconds:.2f} s |")
+    for key, sign in (("S", 1), ("depth_m", -1)):
+        taus = [
+            kendall([sign * one[key] for one in drives], [one["truth"] for one in drives])
+            for drives in zip(*found.values(), strict=True)
+        ]
+        print(f"Kendall's tau of {key} and truth: {study.interval(taus)}")
 
 
 if __name__ == "__main__":

@@ -1,27 +1,17 @@
 """Loading a sample from plain files, warm, in one process, against the plain NumPy loader.
 
 `pytest tests/benchmarks/test_bench_dataset.py --benchmark-enable` measures scans of 125,000 points
-on the published grid; without that every case runs once on small scans. `python
-tests/benchmarks/test_bench_dataset.py` prints the table of docs/performance.md.
+on the published grid; without that every case runs once on small scans.
 """
 
 from __future__ import annotations
 
-import os
-import sys
-import tempfile
-import time
-from collections.abc import Callable
 from pathlib import Path
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for the table: one thread on either side
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1]))  # for the table: pytest has it already
 from helpers.datasets.drives import write_drive
-from helpers.references.plain_loader import PlainLoader
+from helpers.references.plain_loader import LOADERS, PlainLoader
 from helpers.scenes.lidar_frames import street_frame
 
 from carlasc.dataset.samples import Dataset
@@ -65,10 +55,10 @@ def places(history: int, in_order: bool) -> np.ndarray:
 @pytest.mark.parametrize("history", [1, 5, 16])
 @pytest.mark.parametrize("order", ["random", "in order"])
 @pytest.mark.parametrize("what", ["occupancy", "density"])
-@pytest.mark.parametrize("loader", ["carlasc", "plain"])
+@pytest.mark.parametrize("loader", ["carlasc", *LOADERS])
 def test_bench_loading(benchmark, street, history, order, what, loader):
-    if loader == "plain":
-        dataset = PlainLoader(street, history, density=what == "density")
+    if loader in LOADERS:
+        dataset = LOADERS[loader](street, history, density=what == "density")
     else:
         dataset = Dataset(street, history=history, fields=(what, "labels", "known"))
     frames = list(places(history, order == "in order"))
@@ -81,50 +71,10 @@ def test_bench_loading(benchmark, street, history, order, what, loader):
 
     frame, sample = benchmark(load)
     truth = PlainLoader(street, history, density=what == "density")[int(frame)]
-    assert (sample[what] == truth[what]).all() and (sample["labels"] == truth["labels"]).all()
-
-
-def _milliseconds(load: Callable[[int], object], frames: np.ndarray, repeats: int) -> float:
-    """Return the mean over frames of each one's best time in several passes.
-
-    Processor time: with one thread and warm files it is the time on an idle machine, on a busy one
-    too.
-    """
-    best = np.full(len(frames), np.inf)
-    for _ in range(repeats):
-        for place, frame in enumerate(frames):
-            start = time.process_time()
-            load(int(frame))
-            best[place] = min(best[place], time.process_time() - start)
-    return float(best.mean() * 1e3)
-
-
-def print_table() -> None:
-    """Print the table of docs/performance.md."""
-    with tempfile.TemporaryDirectory() as temporary:
-        street = write_street(Path(temporary) / "Train" / "Town01_Light" / "cartesian", full=True)
-        points = np.mean([path.stat().st_size / 16 for path in (street / "velodyne").iterdir()])
-        print(f"{points:.0f} points a scan\n")
-        print(
-            "| sample | order | plain NumPy | carlasc | ratio | reading alone "
-            "|\n|---|---|---|---|---|---|"
-        )
-        for what in ("occupancy", "density"):
-            for history in (1, 5, 16):
-                plain = PlainLoader(street, history, density=what == "density")
-                for order in ("random", "in order"):
-                    frames = places(history, order == "in order")
-                    dataset = Dataset(street, history=history, fields=(what, "labels", "known"))
-                    dataset[0]
-                    ours = _milliseconds(dataset.__getitem__, frames, 10)
-                    theirs = _milliseconds(plain.__getitem__, frames[:6], 3)
-                    floor = _milliseconds(
-                        lambda frame, h=history: _read(street, frame, h), frames, 5
-                    )
-                    print(
-                        f"| {what}, T = {history} | {order} | {theirs:.1f} ms | {ours:.2f} ms | "
-                        f"{theirs / ours:.0f}x | {floor:.2f} ms |"
-                    )
+    # with float32, points at the edge of a voxel may be in its neighbour
+    wrong = 0 if loader in ("carlasc", "plain") else 2e-5
+    assert (sample[what] != truth[what]).mean() <= wrong
+    assert (sample["labels"] == truth["labels"]).all()
 
 
 def _read(folder: Path, frame: int, history: int) -> None:
@@ -133,7 +83,3 @@ def _read(folder: Path, frame: int, history: int) -> None:
         (folder / "velodyne" / f"{past:06d}.bin").read_bytes()
     for suffix in (".label", ".bin"):
         (folder / "evaluation" / f"{frame:06d}{suffix}").read_bytes()
-
-
-if __name__ == "__main__":
-    print_table()

@@ -54,6 +54,9 @@ def test_sound_grids_have_no_fault(town):
     assert {
         states[name] for name in ("fit", "axes", "shift x", "shift y", "yaw", "voxel size", "lag")
     } == {"sound"}
+    (depth,) = [one for one in result.verdicts["cartesian"] if one.check == "depth error"]
+    assert depth.unit == "m"
+    assert 0.2 < depth.low < depth.value < depth.high < 1.5  # rays graze the ground far away
 
 
 MOVED = {

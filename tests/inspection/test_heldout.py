@@ -23,7 +23,7 @@ from carlasc.groundtruth.from_scans.motion_pass import find_actors
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
 from carlasc.groundtruth.inputs import GridPlan
 from carlasc.inspection import HeldOutScores, HoldoutResult, holdout
-from carlasc.inspection.heldout_scores import VEHICLE_M, swept_voxels
+from carlasc.inspection.heldout_scores import VEHICLE_M, depth_errors, swept_voxels
 from carlasc.storage import FolderSink, layout
 
 FRAMES = 17
@@ -280,3 +280,14 @@ def test_the_rays_end_in_a_verdict(counts, swept, state, fault):
     result = HoldoutResult("here", GridSpec.published(), 10, {"A": scores})
     assert (result.state, result.to_dict()["state"]) == (state, state)
     assert result.faults.get("A", "").startswith(fault)
+
+
+def test_depth_errors_are_those_of_the_first_surface_or_of_the_edge_of_the_grid():
+    wall = np.zeros(SMALL.size, bool)
+    wall[4] = True  # from x = 4 to 5 m
+    origins = np.tile([0.5, 0.5, 0.5], (4, 1))
+    points = np.array([[4.5, 0.5, 0.5], [9.5, 0.5, 0.5], [2.5, 0.5, 0.5], [0.5, 0.5, 0.5]])
+    errors = depth_errors(wall, SMALL, origins, points)
+    np.testing.assert_allclose(errors, [0, 5, 2, 0])
+    errors = depth_errors(np.zeros_like(wall), SMALL, origins, points)
+    np.testing.assert_allclose(errors, [5.5, 0.5, 7.5, 0])

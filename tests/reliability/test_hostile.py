@@ -13,17 +13,10 @@ pytest.importorskip("h5py")
 
 
 @pytest.mark.slow
-def test_a_slice_of_the_cases_does_no_harm(tmp_path: Path) -> None:
-    outcome = in_fresh_process(run, 10, 2, tmp_path)
+def test_half_of_the_cases_do_no_harm(tmp_path: Path) -> None:
+    outcome = in_fresh_process(run, 260, 2, tmp_path)  # `make faults` tries all
     assert outcome.found == []
-    assert outcome.tried == 10
-
-
-@pytest.mark.slow
-def test_no_case_does_harm(tmp_path: Path) -> None:
-    outcome = in_fresh_process(run, 10_000, 0, tmp_path)
-    assert outcome.found == []
-    assert outcome.tried > 200
+    assert outcome.tried == 260
 
 
 def shout() -> None:

@@ -235,7 +235,8 @@ class ScanSequence(StoredSequence):
             return whole
         window = [*feed.window_of(number), number]
         scans = [(other, own[str(other)], feed.pose(other).tobytes()) for other in window]
-        actors = self.actors.between(number + first, number + last).to_bytes("")
+        near = self.actors.between(number + first, number + last)
+        actors = near.to_bytes("", is_compressed=False)  # to compress them costs half a grid
         return combined(scans, actors, self.shared(), feed.must_find_ground)
 
     @property

@@ -29,7 +29,7 @@ from carlasc.errors import tried_twice
 from carlasc.inspection.auditing.geometry import families
 from carlasc.inspection.auditing.matching import MatchedGrids
 from carlasc.inspection.auditing.verdicts import Sums, add
-from carlasc.inspection.heldout_scores import BANDS_M, lowest_of_columns
+from carlasc.inspection.heldout_scores import BANDS_M, depth_errors, lowest_of_columns
 from carlasc.inspection.points_in_voxels import labels_at
 from carlasc.motion.tracks import FIRST_FOUND, MovingActors, Track
 
@@ -68,6 +68,7 @@ class _Frame:
     known: BoolArray | None
     crossed: IntArray
     turns: bool  # whether the grid is cylindrical
+    errors_m: FloatArray | None  # of the depth of its rays; None in a cylindrical grid
 
     @cached_property
     def hit(self) -> BoolArray:
@@ -116,6 +117,8 @@ class FrameCounter:
         self._add_classes(sums, seen)
         self._add_unknown(sums, seen)
         self._add_held_out(sums, seen)
+        if seen.errors_m is not None:
+            add(sums, "depth", [len(seen.errors_m), np.rint(1000 * seen.errors_m).sum()])
         kinds = np.where(seen.occupied, OCCUPIED, FREE).astype(np.uint8)
         kinds[self._add_phantoms(sums, seen)] = PHANTOM
         kinds[self._add_actors(sums, seen)] = TRAIL
@@ -130,11 +133,16 @@ class FrameCounter:
         rays = rays[:: max(1, len(rays) // _RAYS)]
         begun = scan.others.get("origins", np.zeros_like(scan.points))[rays]
         margin = 1.5 * float(np.linalg.norm(spec.voxel_size[[0, 0, 2]]))
-        crossed = crossings(self.matched.place(begun), points[rays], spec, margin)
+        begun = self.matched.place(begun)
+        crossed = crossings(begun, points[rays], spec, margin)
         voxels = np.where(returns, spec.flat_index(points), -1)
         kinds = labels if labels.dtype == np.uint8 else np.minimum(labels, MAX_ID)
         turns = spec.coordinates == "cylindrical"
-        return _Frame(frame, scan, points, voxels, kinds, occupied, known, crossed, turns)
+        errors = None
+        if not turns:
+            inside = voxels[rays] >= 0
+            errors = depth_errors(occupied, spec, begun[inside], points[rays[inside]])
+        return _Frame(frame, scan, points, voxels, kinds, occupied, known, crossed, turns, errors)
 
     @cached_property
     def _scan(self) -> Callable[[int], Scan]:

@@ -93,6 +93,13 @@ class _Judge:
             self.one.classes,
             "make these voxels free",
         )
+        if (depth := self.stretches.share("depth")) is not None:
+            value, low, high = (1e-3 * share for share in depth)
+            text = (
+                f"{value:.2f} m ({low:.2f} to {high:.2f}) in the mean between a return and the "
+                "first occupied voxel on its ray"
+            )
+            yield self._say("depth error", False, text, (value, low, high), "", "m")
         yield from self._actors()
         yield self._share(
             "ground columns",

@@ -92,7 +92,7 @@ FILES: dict[str, dict[str, Row]] = {
             "s",
             f"refining the poses of 60 scans of 28,800 rays, {name}: processor time",
         )
-        for name in ("carlasc", "Open3D")
+        for name in ("carlasc", "Open3D", "Open3D_best")
     },
     "converting": {
         "test_bench_copy": Row("convert.copy", "ms", "copying the files of a scan", 8),
