@@ -393,22 +393,41 @@ def _count_around(world: FloatArray, groups: list[IntArray], static: BoolArray) 
     """
     # Row and column in one number, so that neighbours are at fixed steps: 2^20 cells are 367 km.
     cell = np.floor(world[:, :2] / _CELL_M).astype(np.int64) + (1 << 20)
-    key = (cell[:, 0] << 21) | cell[:, 1]
-    rows = np.flatnonzero(static)
+    key, rows = (cell[:, 0] << 21) | cell[:, 1], np.flatnonzero(static)
     rows = rows[np.argsort(key[rows], kind="stable")]
-    keys, heights = key[rows], world[rows, 2]
-    steps = np.array([(row << 21) + column for row in (-1, 0, 1) for column in (-1, 0, 1)])
-    counts = []
-    for group in groups:
-        cells = np.unique(np.unique(key[group])[:, None] + steps)
-        begin, end = np.searchsorted(keys, cells), np.searchsorted(keys, cells, side="right")
-        lower, upper = world[group, 2].min() - _BAND_M, world[group, 2].max() + _BAND_M
-        near = np.concatenate(
-            [heights[a:b] for a, b in zip(begin.tolist(), end.tolist(), strict=True)]
-        )
-        # static points of the group itself count too
-        counts.append(int(((near >= lower) & (near <= upper)).sum()))
-    return tuple(counts)
+    keys, heights, counted = key[rows], world[rows, 2], np.zeros(len(rows), np.int64)
+    return tuple(
+        _count_beside(np.sort(key[group]), world[group, 2], keys, heights, counted, turn)
+        for turn, group in enumerate(groups, 1)
+    )
+
+
+@cached
+def _count_beside(
+    cells: IntArray,
+    inside: FloatArray,
+    keys: IntArray,
+    heights: FloatArray,
+    counted: IntArray,
+    turn: int,
+) -> int:
+    """Return how many points, by their sorted cells and their heights, are in or beside the sorted
+    cells of a group, at the heights of its points; `counted` marks them with the turn of the group.
+    """
+    lower, upper, count = inside.min() - _BAND_M, inside.max() + _BAND_M, 0
+    for k in range(len(cells)):
+        if k and cells[k] == cells[k - 1]:
+            continue
+        for row in (-1, 0, 1):
+            first = cells[k] + (row << 21) - 1
+            at = np.searchsorted(keys, first)
+            while at < len(keys) and keys[at] <= first + 2:
+                # static points of the group itself count too
+                if counted[at] != turn and lower <= heights[at] <= upper:
+                    counted[at] = turn
+                    count += 1
+                at += 1
+    return count
 
 
 _COLUMNS = 1024

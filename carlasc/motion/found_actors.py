@@ -115,8 +115,9 @@ class ActorFollower:
         self.moved[scan.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
         self._poses.append(scan.world_T_sensor)
         self._near[scan.near] += 1
+        sensor_T_world = invert(scan.world_T_sensor)
         for members, points in zip(scan.clusters, scan.points, strict=True):
-            local = transform_points(invert(scan.world_T_sensor), points)
+            local = transform_points(sensor_T_world, points)
             cells = cells_around(local)
             self._freed[cells] += 1
             if len(cells) and np.abs(local).max() < OWN_REACH_M:
@@ -384,25 +385,21 @@ def _join_parts(links: list[_Link], deformable: Collection[int]) -> list[_Link]:
 
     Rays that meet a side at a grazing angle are far apart, and split it.
     """
-    joined = list(links)
-    bounds = [[*link.lower.tolist(), *link.upper.tolist()] for link in links]
-    i = 0
+    joined, i = list(links), 0
+    lower, upper = (
+        np.array([getattr(link, name) for link in links]) for name in ("lower", "upper")
+    )
     while i < len(joined):
-        j = i + 1
-        while j < len(joined):
-            near = all(
-                max(bounds[i][axis] - bounds[j][axis + 3], bounds[j][axis] - bounds[i][axis + 3])
-                <= _PARTS_M
-                for axis in range(3)
-            )
-            if near and _are_parts(joined[i], joined[j], deformable):
-                joined[i] = joined[i].joined(joined.pop(j))
-                del bounds[j]
-                bounds[i] = [*joined[i].lower.tolist(), *joined[i].upper.tolist()]
-                j = i + 1
-            else:
-                j += 1
-        i += 1
+        gaps = np.maximum(lower[i] - upper[i + 1 :], lower[i + 1 :] - upper[i])
+        near = np.flatnonzero((gaps <= _PARTS_M).all(axis=1)) + i + 1
+        parts = (j for j in near.tolist() if _are_parts(joined[i], joined[j], deformable))
+        j = next(parts, None)
+        if j is None:
+            i += 1
+            continue
+        joined[i] = joined[i].joined(joined.pop(j))
+        lower, upper = np.delete(lower, j, axis=0), np.delete(upper, j, axis=0)
+        lower[i], upper[i] = joined[i].lower, joined[i].upper
     return joined
 
 
