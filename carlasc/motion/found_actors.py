@@ -115,8 +115,9 @@ class ActorFollower:
         self.moved[scan.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
         self._poses.append(scan.world_T_sensor)
         self._near[scan.near] += 1
+        sensor_T_world = invert(scan.world_T_sensor)
         for members, points in zip(scan.clusters, scan.points, strict=True):
-            local = transform_points(invert(scan.world_T_sensor), points)
+            local = transform_points(sensor_T_world, points)
             cells = cells_around(local)
             self._freed[cells] += 1
             if len(cells) and np.abs(local).max() < OWN_REACH_M:
@@ -253,31 +254,6 @@ class _ActorChain:
         slopes = (offsets[:, None, None] * corners).sum(axis=0) / np.square(offsets).sum()
         least = np.take_along_axis(slopes, np.abs(slopes).argmin(axis=0)[None], axis=0)[0]
         return np.where(np.abs(slopes).max(axis=0) > 0, (least + slopes[1]) / 2, 0.0)
-
-    def cost(self, link: _Link) -> float | None:
-        """Return how badly an observation continues the chain; None if it cannot."""
-        last, velocity = self.last, self.velocity
-        if last.segment.label != link.segment.label:
-            return None
-        elapsed = link.seconds - last.seconds
-        shift = np.zeros(3) if velocity is None else velocity * elapsed
-        gap = np.maximum(
-            np.maximum(last.lower + shift - link.upper, link.lower - last.upper - shift), 0.0
-        )
-        offset = link.middle - last.middle - shift
-        reach = _REACH_M + (min(_MAX_SPEED_M_S * elapsed, 4.0) if velocity is None else 0.0)
-        if (
-            np.linalg.norm(gap[:2], axis=0) > reach
-            or abs(gap[2]) > _REACH_M
-            or np.linalg.norm(offset[:2], axis=0) > 3 * reach + 2.0
-        ):
-            return None
-        sizes = np.abs((link.upper - link.lower) - (last.upper - last.lower))
-        return float(
-            np.linalg.norm(gap, axis=0)
-            + 0.3 * np.linalg.norm(offset[:2], axis=0)
-            + 0.2 * sizes.sum()
-        )
 
     def covers(self, link: _Link) -> bool:
         """Return whether an observation is inside the place that is expected of the next one."""
@@ -421,26 +397,27 @@ def _join_parts(links: list[_Link], deformable: Collection[int]) -> list[_Link]:
 
     Rays that meet a side at a grazing angle are far apart, and split it.
     """
-    joined = list(links)
-    i = 0
+    joined, i = list(links), 0
+    lower, upper = (
+        np.array([getattr(link, name) for link in links]) for name in ("lower", "upper")
+    )
     while i < len(joined):
-        j = i + 1
-        while j < len(joined):
-            if _are_parts(joined[i], joined[j], deformable):
-                joined[i] = joined[i].joined(joined.pop(j))
-                j = i + 1
-            else:
-                j += 1
-        i += 1
+        gaps = np.maximum(lower[i] - upper[i + 1 :], lower[i + 1 :] - upper[i])
+        near = np.flatnonzero((gaps <= _PARTS_M).all(axis=1)) + i + 1
+        parts = (j for j in near.tolist() if _are_parts(joined[i], joined[j], deformable))
+        j = next(parts, None)
+        if j is None:
+            i += 1
+            continue
+        joined[i] = joined[i].joined(joined.pop(j))
+        lower, upper = np.delete(lower, j, axis=0), np.delete(upper, j, axis=0)
+        lower[i], upper[i] = joined[i].lower, joined[i].upper
     return joined
 
 
 def _are_parts(one: _Link, other: _Link, deformable: Collection[int]) -> bool:
     label = one.segment.label
-    if (
-        label != other.segment.label
-        or (np.maximum(one.lower - other.upper, other.lower - one.upper) > _PARTS_M).any()
-    ):
+    if label != other.segment.label:
         return False
     if label in deformable or (not (label and deformable) and one.is_small and other.is_small):
         return False
@@ -457,14 +434,7 @@ def _link(
     links = _join_parts(
         [_Link.of(evidence, index) for index in range(len(evidence.clusters))], deformable
     )
-    costs = []
-    ends = np.array([chain.last.middle for chain in alive]).reshape(-1, 3)
-    for i, link in enumerate(links):
-        for j in np.flatnonzero(np.abs(ends - link.middle).max(axis=1) < _FAR_M).tolist():
-            cost = alive[j].cost(link)
-            if cost is not None:
-                costs.append((cost, i, j))
-    taken = best_pairs(costs)
+    taken = best_pairs(_costs(links, alive) if alive else [])
     extra = {
         i: j
         for i in range(len(links))
@@ -479,3 +449,33 @@ def _link(
     for i, j in taken.items():
         alive[j].append(links[i])
     alive.extend(fresh)
+
+
+def _costs(links: list[_Link], alive: list[_ActorChain]) -> list[tuple[float, int, int]]:
+    """Return how badly each observation continues each chain that it can continue, with the numbers
+    of both.
+    """
+    ends = [chain.last for chain in alive]
+    label = np.array([end.segment.label for end in ends])
+    seconds = np.array([end.seconds for end in ends])
+    lower, upper = (np.stack([getattr(end, name) for end in ends]) for name in ("lower", "upper"))
+    middle, size = (lower + upper) / 2, upper - lower
+    fresh = np.array([chain.velocity is None for chain in alive])
+    velocity = np.stack(
+        [np.zeros(3) if chain.velocity is None else chain.velocity for chain in alive]
+    )
+    costs = list[tuple[float, int, int]]()
+    for i, link in enumerate(links):
+        elapsed = link.seconds - seconds
+        shift = velocity * elapsed[:, None]
+        gap = np.maximum(np.maximum(lower + shift - link.upper, link.lower - upper - shift), 0.0)
+        offset = link.middle - middle - shift
+        reach = _REACH_M + np.where(fresh, np.minimum(_MAX_SPEED_M_S * elapsed, 4.0), 0.0)
+        aside = np.linalg.norm(offset[:, :2], axis=1)
+        can = (label == link.segment.label) & (np.abs(middle - link.middle).max(axis=1) < _FAR_M)
+        can &= (np.linalg.norm(gap[:, :2], axis=1) <= reach) & (gap[:, 2] <= _REACH_M)
+        can &= aside <= 3 * reach + 2.0
+        sizes = np.abs((link.upper - link.lower) - size).sum(axis=1)
+        cost = np.linalg.norm(gap, axis=1) + 0.3 * aside + 0.2 * sizes
+        costs += [(float(cost[j]), i, j) for j in np.flatnonzero(can).tolist()]
+    return costs

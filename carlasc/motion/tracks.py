@@ -263,8 +263,9 @@ def _fit_box(
         for segment, position, heading in zip(chain, positions, headings, strict=True):
             pose = rotation_z(heading)
             pose[:3, 3] = position
-            body.append(transform_points(invert(pose), segment.points))
-            sensors.append(transform_points(invert(pose), segment.origin))
+            actor_T_world = invert(pose)
+            body.append(transform_points(actor_T_world, segment.points))
+            sensors.append(transform_points(actor_T_world, segment.origin))
         extent = measure(body, np.stack(sensors))
         middle = (extent.lower + extent.upper) / 2
         positions = positions + rotate_vectors(rotation_z(headings[best]), middle)
