@@ -33,7 +33,7 @@ from carlasc.converting.plans import (
 from carlasc.converting.plans import follow as estimate
 from carlasc.converting.protocol import Converter, FrameHandle, Trajectory
 from carlasc.converting.registry import find_recordings, open_converter
-from carlasc.converting.run import describe, plan_grids
+from carlasc.converting.run import check_arguments, describe, plan_grids
 from carlasc.converting.stages import Conversion
 from carlasc.core.arrays import FloatArray
 from carlasc.core.frames import FrameRange
@@ -57,6 +57,7 @@ from carlasc.running.processes import one_pool
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout as files
 from carlasc.storage.files import AnyPath
+from carlasc.storage.folder import FolderSink
 from carlasc.storage.inputs import PROVISIONAL, MadeFrom
 from carlasc.storage.layout import Metadata, place_of
 from carlasc.storage.opening import as_sink
@@ -106,16 +107,18 @@ def follow(
 
     Raises:
         ArgumentError: an argument has a wrong value, or does not fit a growing folder.
+        ConflictError: `out` lies inside `source`, or holds other data.
         MissingDataError: there is no such folder.
         FormatError: the first scan shows that axes or options are wrong.
         DependencyError: kiss-icp is not installed.
     """
     check_types(follow, locals())
     root, sink = Path(source), as_sink(out)
+    check_arguments(root, sink, "all", grids)
     if layout.level:
         raise ArgumentError("level", expected="False while the drive grows", found="True")
-    if not root.is_dir():
-        raise MissingDataError(root, expected="a folder", found="nothing", advice="check the path")
+    if not isinstance(sink, FolderSink):
+        raise ArgumentError("out", expected="a folder, while the drive grows", found=str(out))
     poses = replace(poses, source="kiss-icp")
     converter = open_converter(name, root, options)
     look = _Folder(converter, idle_s, say, wait)
