@@ -210,5 +210,5 @@ def test_a_sensor_in_real_time(tmp_path):
     assert "the drive has" in result.stderr and "(24 existed)" in result.output
     assert CliRunner().invoke(app, [*run, str(tmp_path / "fresh")]).exit_code == 0
     assert files(tmp_path / "out") == files(tmp_path / "fresh")
-    refused = CliRunner().invoke(app, [*run, str(tmp_path / "out"), "--follow", "--part", "1/2"])
+    refused = CliRunner().invoke(app, [*run, str(tmp_path / "out"), "--follow", "--frames", ":3"])
     assert refused.exit_code and "--follow" in refused.stderr
