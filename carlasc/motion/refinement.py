@@ -14,7 +14,8 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from itertools import islice, pairwise
 from typing import Self
 
@@ -22,6 +23,7 @@ import numpy as np
 
 from carlasc.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from carlasc.core.cells import first_of_cells
+from carlasc.core.choices import LoopMode
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import invert, multiply, small_motions, transform_points
 from carlasc.errors import reading
@@ -36,6 +38,7 @@ from carlasc.motion.joint_alignment import (
     spread_of,
     to_plane,
 )
+from carlasc.motion.loops import Submaps, close_loops
 from carlasc.motion.solving import principal_axes
 from carlasc.storage.arrays import ArrayFormat, open_npz
 
@@ -49,6 +52,7 @@ _FORMATS = {
     "after_m": ArrayFormat(("<f8",), (None,)),
     "refined": ArrayFormat(("|b1",), (None,)),
     "fits": ArrayFormat(("|b1",), (None,)),
+    "loops": ArrayFormat(("<f8",), (None, 4)),
 }
 _STRETCH = 2 * HALF_BLOCK  # scans whose poses become final together
 _THIN_M = 0.3  # one point per cell of this size is used
@@ -109,6 +113,8 @@ class RefinedPoses:
         refined: (F,) bool, the scans with a changed motion.
         fits: (F,) bool, False where walls of one scan are not flat together with the other scans:
             such poses belong to another drive or to other frames, and are not refined.
+        loops: (L, 4) the loops that were closed: the rows of two scans of one place, and the
+            distance of the surfaces of the two passes before and after, metres.
     """
 
     given: FloatArray
@@ -117,6 +123,7 @@ class RefinedPoses:
     after_m: FloatArray
     refined: BoolArray
     fits: BoolArray
+    loops: FloatArray = field(default_factory=partial(np.empty, (0, 4)))
 
     def changes(self) -> FloatArray:
         """Return the (F - 1, 6) changes of the motions from each scan to the next one: metres, then
@@ -163,7 +170,7 @@ class RefinedPoses:
             key = file.read("key", ArrayFormat(("u1",), (None,))).tobytes()
             arrays = {name: file.read(name, expected) for name, expected in _FORMATS.items()}
         with reading(where, "poses refined by carlasc", "remove it"):
-            if len({len(array) for array in arrays.values()}) != 1:
+            if len({len(array) for name, array in arrays.items() if name != "loops"}) != 1:
                 raise ValueError("arrays of different lengths")
             return cls(**arrays), key.decode()
 
@@ -173,6 +180,7 @@ def refine_poses(
     given: FloatArray,
     *,
     always: bool = False,
+    loops: LoopMode = "auto",
     steps: Callable[[int], None] | None = None,
 ) -> RefinedPoses:
     """Refine the poses of a drive.
@@ -184,6 +192,7 @@ def refine_poses(
         scans: the scans, in order of time; read one after the other.
         given: (F, 4, 4) float64 world_T_sensor of the scans.
         always: whether stretches are also refined where scans do not agree better afterwards.
+        loops: whether loops are closed: see `carlasc.motion.loops`.
         steps: called with the number of scans that were read since the last call.
     """
     count, poses = len(given), given.copy()
@@ -194,7 +203,7 @@ def refine_poses(
     )
     fits = np.ones(count, np.bool_)
     scans, kept, first = iter(scans), list[ThinnedScan](), 0
-    begin = 0
+    begin, submaps = 0, Submaps()
     while begin < count and count >= MIN_SCANS:
         end = count if count - begin < _STRETCH + HALF_BLOCK else begin + _STRETCH
         start, last = max(0, begin - HALF_BLOCK), min(end + HALF_BLOCK, count)
@@ -219,7 +228,13 @@ def refine_poses(
         if chosen:
             poses[begin:end], refined[begin:end] = aligned[rows], True
         after[begin:end] = now if chosen else before[begin:end]
+        for row in range(begin, end if loops == "auto" else begin):
+            submaps.add(row, kept[row - start].used, kept[row - start].measured, poses[row])
         begin = end
+    submaps.finish()
+    closed, found = close_loops(submaps.done if fits.all() else [], poses)
+    if len(found) and (always or _is_better(found[:, 2], found[:, 3])):
+        return RefinedPoses(given, closed, before, after, np.ones_like(refined), fits, found)
     return RefinedPoses(given, poses, before, after, refined, fits)
 
 
