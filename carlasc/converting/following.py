@@ -33,7 +33,7 @@ from carlasc.converting.plans import (
 from carlasc.converting.plans import follow as estimate
 from carlasc.converting.protocol import Converter, FrameHandle, Trajectory
 from carlasc.converting.registry import find_recordings, open_converter
-from carlasc.converting.run import describe, plan_grids
+from carlasc.converting.run import check_arguments, describe, plan_grids
 from carlasc.converting.stages import Conversion
 from carlasc.core.arrays import FloatArray
 from carlasc.core.frames import FrameRange
@@ -57,6 +57,7 @@ from carlasc.running.processes import one_pool
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout as files
 from carlasc.storage.files import AnyPath
+from carlasc.storage.folder import FolderSink
 from carlasc.storage.inputs import PROVISIONAL, MadeFrom
 from carlasc.storage.layout import Metadata, place_of
 from carlasc.storage.opening import as_sink
@@ -106,16 +107,18 @@ def follow(
 
     Raises:
         ArgumentError: an argument has a wrong value, or does not fit a growing folder.
+        ConflictError: `out` lies inside `source`, or holds other data.
         MissingDataError: there is no such folder.
         FormatError: the first scan shows that axes or options are wrong.
         DependencyError: kiss-icp is not installed.
     """
     check_types(follow, locals())
     root, sink = Path(source), as_sink(out)
+    check_arguments(root, sink, "all", grids)
     if layout.level:
         raise ArgumentError("level", expected="False while the drive grows", found="True")
-    if not root.is_dir():
-        raise MissingDataError(root, expected="a folder", found="nothing", advice="check the path")
+    if not isinstance(sink, FolderSink):
+        raise ArgumentError("out", expected="a folder, while the drive grows", found=str(out))
     poses = replace(poses, source="kiss-icp")
     converter = open_converter(name, root, options)
     look = _Folder(converter, idle_s, say, wait)
@@ -141,11 +144,11 @@ class _Folder:
     idle_s: float | None
     say: Callable[[str], None]
     wait: Callable[[float], None]
-    last: str | None = None
 
     def scans(self) -> Iterator[tuple[FrameHandle, float | None] | None]:
         """Yield each scan when it is whole, and its time; None after each look."""
         problem, waited, before = "", 0.0, dict[str, tuple[int, int]]()
+        last, taken = "", set[str]()  # scans may be moved away, so that the last one is gone
         while self.idle_s is None or waited < self.idle_s:
             fresh, times = list[FrameHandle](), None
             try:
@@ -155,8 +158,8 @@ class _Folder:
                         "source", expected="one growing recording", found=str(1 + len(others))
                     )
                 places = [handle.location for handle in recording.frames]
-                start = places.index(self.last) + 1 if self.last in places else 0
-                fresh = [*recording.frames[start:]]
+                start = places.index(last) + 1 if last in places else 0
+                fresh = [one for one in recording.frames[start:] if one.location not in taken]
                 times = recording.times() if fresh else None
             except (MissingDataError, FormatError, OSError) as error:
                 if str(error) != problem:
@@ -166,17 +169,18 @@ class _Folder:
             for handle in fresh:
                 if before.get(handle.location) != now[handle.location]:
                     break  # it is new, or still being written
-                self.last = handle.location
+                last = handle.location
+                taken.add(last)
                 yield handle, None if times is None else float(times[handle.number])
             if now and now != before:
-                if waited >= _PAUSE_S and self.last is not None:
+                if waited >= _PAUSE_S and last:
                     self.say(f"scans come again after {waited:g} s")
                 waited = 0.0
             before = now
             yield None
             self.wait(_LOOK_S)
             waited += _LOOK_S
-            if waited - _LOOK_S < _PAUSE_S <= waited and self.last is not None:
+            if waited - _LOOK_S < _PAUSE_S <= waited and last:
                 self.say(f"no scan for {_PAUSE_S:g} s: waiting")
 
 

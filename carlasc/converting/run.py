@@ -168,7 +168,7 @@ def convert(
     converter = open_converter(name, root, options)
     target, sink = layout.of(converter), as_sink(out, part=run.part)
     check_shared(sink.location, run)
-    _check(root, sink, split, grids)
+    check_arguments(root, sink, split, grids)
     compare = layout.compare_inputs
     found = find_recordings(converter)
     recordings = _deal(choose_recordings(found, root, sequences, split), run.part)
@@ -449,7 +449,7 @@ def _deal(recordings: Series[Recording], part: Part) -> list[Recording]:
     return [recordings[index] for index in np.flatnonzero(shares == part.number - 1).tolist()]
 
 
-def _check(source: Path, sink: Sink, split: str, grids: Grids) -> None:
+def check_arguments(source: Path, sink: Sink, split: str, grids: Grids) -> None:
     """Check the arguments, before recordings are searched for.
 
     Raises:

@@ -44,7 +44,6 @@ class ProvisionalFrame:
         """Make and write the grid of the frame, marked as provisional; return why it failed.
 
         Raises:
-            ConflictError: the grid exists, and carlasc did not make it.
             StorageError: the grid cannot be written.
         """
         observe = cast(FromScans, self.plan.observe)
