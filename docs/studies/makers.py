@@ -246,8 +246,8 @@ def show(found: dict[str, list[dict[str, float]]], usable: Mapping[str, Rival]) 
     """Print the measures of each maker over drives, the best in truth first, and how well the
     orders of S and of the depth agree with that of truth.
     """
-    print("\n| maker | told | truth | known | all | S | depth error, m | CPU time |")
-    print("|---|---|---:|---:|---:|---:|---:|---:|")
+    print("\n| maker (told) | truth | known | all | S | depth error, m | CPU time |")
+    print("|---|---:|---:|---:|---:|---:|---:|")
     means = {name: np.mean([d["truth"] for d in drives]) for name, drives in found.items()}
     for name in sorted(found, key=lambda one: -means[one]):
         truth, whole, score, depth = (
@@ -257,9 +257,8 @@ def show(found: dict[str, list[dict[str, float]]], usable: Mapping[str, Rival]) 
         known = np.mean([drive["known"] for drive in found[name]])
         seconds = np.mean([drive["seconds"] for drive in found[name]])
         told = usable[name.split(";")[0]].told
-        print(
-            f"| {name} | {told} | {truth} | {known:.2f} | {whole} | {score} | {depth} | {seconds:.2f} s |"
-        )
+        cells = (f"{name} ({told})", truth, f"{known:.2f}", whole, score, depth)
+        print(f"| {' | '.join(cells)} | {seconds:.2f} s |")
     for key, sign in (("S", 1), ("depth_m", -1)):
         taus = [
             kendall([sign * one[key] for one in drives], [one["truth"] for one in drives])
