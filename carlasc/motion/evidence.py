@@ -41,6 +41,7 @@ from carlasc.core.geometry import Transform, invert, multiply, thin, transform_p
 from carlasc.core.scans import finite, runs_of_origins
 from carlasc.errors import FormatError
 from carlasc.motion.ground import ground_points
+from carlasc.motion.segments import spread_rows
 
 HORIZON_S = 5.0  # fact: horizon
 """Scans up to this many seconds before and after a scan are looked up."""
@@ -140,8 +141,14 @@ class FreeSpaceEvidence:
         """Return the same with at most `most` of the `points` of each cluster; `clusters` stay
         complete.
         """
-        points = tuple(thin(points, most) for points in self.points)
-        return replace(self, points=points, times=tuple(thin(own, most) for own in self.times))
+        if not self.times:
+            return replace(self, points=tuple(thin(points, most) for points in self.points))
+        rows = [spread_rows(len(points), most) for points in self.points]
+        points, times = (
+            tuple(own[kept] for own, kept in zip(parts, rows, strict=True))
+            for parts in (self.points, self.times)
+        )
+        return replace(self, points=points, times=times)
 
     @property
     def moved(self) -> BoolArray:

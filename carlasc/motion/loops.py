@@ -34,7 +34,13 @@ from carlasc.motion.planes import covariances
 from carlasc.motion.solving import principal_axes, solve_positive
 
 _STEP_M, _SUBMAP_M, _REACH_M = 1.0, 10.0, 30.0  # between used scans; length; of points, sideways
-_CELL_M, _POINTS, _FLAT, _THICK_M, _WIDE_M2 = 1.0, 10, 0.1, 0.08, 0.02  # of a plane: see `Planes`
+_CELL_M, _POINTS, _FLAT, _THICK_M, _WIDE_M2 = (
+    1.0,
+    10,
+    0.1,
+    0.08,
+    0.02,
+)  # of a plane: see `SubmapPlanes`
 _PIXEL_M, _PIXELS, _LEVELS = 0.5, 256, 3  # of images: pixels with points at so many levels
 _APART_M, _NEAR_M, _PASSES = 60.0, 12.0, 3  # of two submaps: along the drive; away; passes tried
 # What poses may be off, per metre of the drive between two submaps, and at least; less in height,
@@ -60,7 +66,7 @@ _LOOP = np.array([0.01, 0.01, 0.01, 0.0003, 0.0003, 0.0003])
 _TOGETHER_M, _AGREE_M, _AGREE_RAD = 60.0, 0.25, np.radians(0.5)
 
 
-class Planes(NamedTuple):
+class SubmapPlanes(NamedTuple):
     """The planes of a submap, at most one per cell.
 
     Attributes:
@@ -74,7 +80,7 @@ class Planes(NamedTuple):
     normals: FloatArray
 
     @classmethod
-    def of(cls, points: Float32Array) -> Planes:
+    def of(cls, points: Float32Array) -> SubmapPlanes:
         """Return the planes of (N, 3) points."""
         _, sums = clusters(points, np.eye(4), _CELL_M, 0.0)
         sums = sums[sums[:, 0] >= _POINTS]
@@ -108,8 +114,8 @@ class Submap(NamedTuple):
     row: int
     along_m: float
     origin: FloatArray
-    planes: Planes
-    held: Planes
+    planes: SubmapPlanes
+    held: SubmapPlanes
     pixels: IntArray
     covered: bool
 
@@ -157,12 +163,12 @@ class Submaps:
         origin = middle[:3, 3].copy()
         used = _near([(one, pose) for _, _, pose, one, _ in self._scans], origin)
         held = _near([(one, pose) for _, _, pose, _, one in self._scans], origin)
-        planes = Planes.of(used)
+        planes = SubmapPlanes.of(used)
         above = (np.abs(planes.normals[:, 2]) > _LEVEL) & (planes.centres[:, 2] > 0.3)
         ground = (np.abs(planes.normals[:, 2]) > _LEVEL) & (planes.centres[:, 2] < -0.3)
         covered = bool(above.sum() > 0.3 * ground.sum())
         self.done.append(
-            Submap(row, along_m, origin, planes, Planes.of(held), _upright(used), covered)
+            Submap(row, along_m, origin, planes, SubmapPlanes.of(held), _upright(used), covered)
         )
         self._scans = []
 
@@ -312,7 +318,7 @@ def _positions(
         best[np.hypot(shifts[:, None] - shifts[row], shifts - shifts[column]) < _PEAK_M] = 0.0
 
 
-def _rise(one: Planes, other: Planes, motion: Transform, most: float) -> float:
+def _rise(one: SubmapPlanes, other: SubmapPlanes, motion: Transform, most: float) -> float:
     """Return how much higher the ground of the first submap lies than that of the second one."""
     lowest = []
     for centres, normals in (one.moved(np.eye(4)), other.moved(motion)):
@@ -328,7 +334,7 @@ def _rise(one: Planes, other: Planes, motion: Transform, most: float) -> float:
 
 
 def _matches(
-    one: Planes, other: Planes, motion: Transform, gate_m: float
+    one: SubmapPlanes, other: SubmapPlanes, motion: Transform, gate_m: float
 ) -> tuple[IntArray, IntArray]:
     """Return the (M,) rows of planes of the first submap, and of the planes of the second one that
     lie on them.
@@ -352,14 +358,16 @@ def _matches(
     return nearest[rows], rows
 
 
-def _apart(one: Planes, other: Planes, motion: Transform, a: IntArray, b: IntArray) -> float:
+def _apart(
+    one: SubmapPlanes, other: SubmapPlanes, motion: Transform, a: IntArray, b: IntArray
+) -> float:
     """Return the root mean square distance of pairs of planes."""
     centres, _ = other.moved(motion)
     off = ((centres[b] - one.centres[a]) * one.normals[a]).sum(axis=1)
     return float(np.sqrt(np.square(off).mean()))
 
 
-def _register(one: Planes, other: Planes, start: Transform) -> Transform:
+def _register(one: SubmapPlanes, other: SubmapPlanes, start: Transform) -> Transform:
     """Return the motion, near a first one, that lays planes of the second submap on the first."""
     poses = start[None].copy()
     for gate in _GATES_M:
@@ -383,7 +391,7 @@ def _inside(centres: FloatArray, origin: FloatArray) -> BoolArray:
     return np.hypot(centres[:, 0] - origin[0], centres[:, 1] - origin[1]) < _INSIDE_M
 
 
-def _common(one: Planes, other: Planes, motion: Transform) -> float:
+def _common(one: SubmapPlanes, other: SubmapPlanes, motion: Transform) -> float:
     """Return the least share of planes of a submap that the other one has too, of walls and of
     all.
     """
@@ -401,7 +409,7 @@ def _common(one: Planes, other: Planes, motion: Transform) -> float:
     return min(shares)
 
 
-def _is_determined(one: Planes, other: Planes, motion: Transform) -> bool:
+def _is_determined(one: SubmapPlanes, other: SubmapPlanes, motion: Transform) -> bool:
     """Return whether the common planes of two submaps are near, and hold every direction."""
     a, b = _matches(one, other, motion, _SAME_M)
     normals = one.normals[a]

@@ -67,6 +67,9 @@ _SURE, _SURELY_M, _ERRORS, _ALIKE = 0.95, 0.0005, 2.5, 5
 # Greatest change of the motion from one scan to the next, and over some scans: poses of another
 # drive need more.
 _FARTHEST_M, _FARTHEST_RAD = 0.7, np.deg2rad(3.0)
+# A drive may return if poses so far from each other, along it, are near each other; estimated poses
+# are less near with the distance.
+_SPARSE_M, _GONE_M, _AROUND_M, _ASTRAY = 5.0, 60.0, 40.0, 0.02
 _SPAN, _OFF_M, _OFF_RAD = 10, 1.0, np.deg2rad(5.0)
 # Poses fit if enough walls of single scans are flat together with the points of other scans there.
 _WALL_M, _WALL_POINTS = 2.0, 12  # size of the cells, and the fewest points of a wall
@@ -203,7 +206,7 @@ def refine_poses(
     )
     fits = np.ones(count, np.bool_)
     scans, kept, first = iter(scans), list[ThinnedScan](), 0
-    begin, submaps = 0, Submaps()
+    begin, submaps = 0, Submaps() if loops == "auto" and _may_return(given) else None
     while begin < count and count >= MIN_SCANS:
         end = count if count - begin < _STRETCH + HALF_BLOCK else begin + _STRETCH
         start, last = max(0, begin - HALF_BLOCK), min(end + HALF_BLOCK, count)
@@ -228,14 +231,29 @@ def refine_poses(
         if chosen:
             poses[begin:end], refined[begin:end] = aligned[rows], True
         after[begin:end] = now if chosen else before[begin:end]
-        for row in range(begin, end if loops == "auto" else begin):
-            submaps.add(row, kept[row - start].used, kept[row - start].measured, poses[row])
+        if submaps is not None:
+            for row, scan, pose in zip(
+                range(begin, end), kept[rows], poses[begin:end], strict=True
+            ):
+                submaps.add(row, scan.used, scan.measured, pose)
         begin = end
-    submaps.finish()
-    closed, found = close_loops(submaps.done if fits.all() else [], poses)
-    if len(found) and (always or _is_better(found[:, 2], found[:, 3])):
-        return RefinedPoses(given, closed, before, after, np.ones_like(refined), fits, found)
+    if submaps is not None and fits.all():
+        submaps.finish()
+        closed, found = close_loops(submaps.done, poses)
+        if len(found) and (always or _is_better(found[:, 2], found[:, 3])):
+            refined[:] = True
+            return RefinedPoses(given, closed, before, after, refined, fits, found)
     return RefinedPoses(given, poses, before, after, refined, fits)
+
+
+def _may_return(given: FloatArray) -> bool:
+    """Return whether a drive may come near a place again that it has left."""
+    steps = np.sqrt(np.square(np.diff(given[:, :3, 3], axis=0)).sum(axis=1))
+    along = np.append(0.0, np.cumsum(steps))
+    rows = np.flatnonzero(np.diff(along // _SPARSE_M, prepend=-1.0))
+    gap, off = (values[:, None] - values for values in (along[rows], given[rows, :2, 3]))
+    near = np.hypot(off[..., 0], off[..., 1]) < _AROUND_M + _ASTRAY * gap
+    return bool((near & (gap > _GONE_M)).any())
 
 
 def _is_better(before: FloatArray, after: FloatArray) -> bool:

@@ -23,6 +23,7 @@ _BESIDE_M = 1.0
 _SAME_VELOCITY_M_S = 0.5  # greatest difference of flow within one rigid actor
 
 _REST_M = 0.5  # margin around an actor in which its static points are searched for
+_GOLDEN = 0.6180339887  # multiples of it, without their integers, are spread evenly
 LINKED_M_S = 2.0  # maximum change of an actor's velocity between two segments
 
 
@@ -59,13 +60,23 @@ class Segment:
 
     def thinned(self, most: int) -> Segment:
         """Return the same with at most `most` of the points; `members` stay complete."""
-        times = None if self.times is None else thin(self.times, most)
-        return replace(self, points=thin(self.points, most), times=times)
+        if self.times is None:
+            return replace(self, points=thin(self.points, most))
+        rows = spread_rows(len(self.points), most)
+        return replace(self, points=self.points[rows], times=self.times[rows])
 
     def at_frame(self, velocity: FloatArray) -> Segment:
         """Return the same with its points moved to the time of the frame, by (3,) m/s, world."""
         points = moved_back(self.points, self.times, velocity)
         return self if self.times is None else replace(self, points=points, times=None)
+
+
+def spread_rows(count: int, most: int) -> IntArray:
+    """Return at most `most` of the rows 0 to `count` - 1, spread evenly, but not at one distance:
+    points of a LiDAR that turns are in order of columns, and every N-th may be of few channels.
+    """
+    steps, apart = np.arange(min(count, most)), max(1.0, count / most)
+    return np.asarray(steps * apart + (apart - 1) * (steps * _GOLDEN % 1.0), np.int64)
 
 
 def moved_back(

@@ -18,13 +18,16 @@ from returning import ReturningDrive
 from carlasc.captures import Lidar
 from carlasc.core.geometry import invert, multiply, small_motions, transform_points
 from carlasc.core.tables import CARLA
+from carlasc.motion import LoopMode
 from carlasc.motion.joint_alignment import clusters
 from carlasc.motion.odometry import follow_scans, usable_points
 from carlasc.motion.planes import covariances
 from carlasc.motion.refinement import ThinnedScan, refine_poses
 from carlasc.motion.solving import principal_axes
 
-DRIVES = (("block", 61, 32), ("there and back", 62, 16))
+DRIVES = (("block", 61, 32, 1), ("block", 61, 32, 2), ("there and back", 62, 16, 1))
+"""Route, seed, channels, and every which channel is used."""
+LOOPS: tuple[LoopMode, ...] = ("never", "auto")
 _RAYS = 1000  # per channel
 _BEYOND_M, _NEAR_M = 60.0, 6.0  # driven since a place was seen; away from it
 _HALF = 15  # scans before and after the place, whose walls are compared
@@ -45,12 +48,28 @@ class Recording(NamedTuple):
     true: NDArray[np.float64]
 
 
+def _view(channels: int) -> tuple[float, float, float]:
+    """Return the range in metres, and the highest and lowest elevations in degrees."""
+    return (80.0, 15.0, -15.0) if channels == 16 else (50.0, 2.0, -25.0)
+
+
+def thinned(drive: Recording, channels: int, every: int) -> Recording:
+    """Return a drive with some of the channels only."""
+    _, upper, lower = _view(channels)
+    points, walls = list[NDArray[np.float32]](), list[NDArray[np.bool_]]()
+    for own, wall in zip(drive.points, drive.walls, strict=True):
+        elevation = np.degrees(np.arctan2(own[:, 2], np.hypot(own[:, 0], own[:, 1])))
+        kept = np.rint((upper - elevation) / (upper - lower) * (channels - 1)) % every == 0
+        points.append(own[kept])
+        walls.append(wall[kept])
+    return Recording(points, walls, drive.true)
+
+
 def record(route: str, seed: int, channels: int, work: Path) -> Recording:
     """Return a drive, which WORK keeps."""
     kept = work / f"{route.replace(' ', '_')}_{seed}_{channels}.npz"
     if not kept.exists():
-        view = (80.0, 15.0, -15.0) if channels == 16 else (50.0, 2.0, -25.0)
-        lidar = Lidar(channels, channels * _RAYS, *view)
+        lidar = Lidar(channels, channels * _RAYS, *_view(channels))
         drive = ReturningDrive(seed, route, lidar)
         frames = study.few(range(drive.frames), 12)
         scans = [drive.record(frame).scan for frame in frames]
@@ -120,21 +139,22 @@ def thicker(drive: Recording, poses: NDArray[np.float64], pairs: list[tuple[int,
 def main() -> None:
     """Print the table."""
     parser = study.options(__doc__)
-    parser.add_argument("--drives", nargs="+", default=[], help="ROUTE:SEED:CHANNELS of others")
+    parser.add_argument("--drives", nargs="+", default=[], help="ROUTE:SEED:CHANNELS:EVERY")
     with study.begin(parser) as given:
         asked = [tuple(one.split(":")) for one in given.drives] or study.few(DRIVES)
         print(
             "| drive | channels | metres | loops | KISS-ICP | refined | with loops | walls before "
             "| walls after |\n|---|" + "---:|" * 8
         )
-        for route, seed, channels in asked:
-            drive = record(route, int(seed), int(channels), given.work)
+        for route, *numbers in asked:
+            seed, channels, every = map(int, numbers)
+            drive = thinned(record(route, seed, channels, given.work), channels, every)
             usable = ((one[usable_points(one)], None) for one in drive.points)
             start = np.stack(list(follow_scans(usable, max_range_m=80.0)))
-            made = []
-            for loops in ("never", "auto"):
-                thinned = map(ThinnedScan.of, drive.points, start)
-                made.append(refine_poses(thinned, start, loops=loops))
+            made = [
+                refine_poses(map(ThinnedScan.of, drive.points, start), start, loops=loops)
+                for loops in LOOPS
+            ]
             pairs = met_again(drive.true) or [(0, len(start) - 1)]
             off = [
                 "{:.2f} m, {:.2f}°".format(*off_at(poses, drive.true, pairs))
@@ -142,7 +162,7 @@ def main() -> None:
             ]
             walls = [f"{thicker(drive, one.poses, pairs):.2f}" for one in made]
             length = np.linalg.norm(np.diff(drive.true[:, :3, 3], axis=0), axis=1).sum()
-            cells = [route, channels, f"{length:.0f}", len(made[1].loops), *off, *walls]
+            cells = [route, channels // every, f"{length:.0f}", len(made[1].loops), *off, *walls]
             print("| " + " | ".join(map(str, cells)) + " |", flush=True)
 
 
