@@ -20,6 +20,7 @@ import math
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +41,7 @@ from carlasc.core.geometry import Transform, invert, multiply, thin, transform_p
 from carlasc.core.scans import finite, runs_of_origins
 from carlasc.errors import FormatError
 from carlasc.motion.ground import ground_points
+from carlasc.motion.segments import spread_rows
 
 HORIZON_S = 5.0  # fact: horizon
 """Scans up to this many seconds before and after a scan are looked up."""
@@ -47,6 +49,9 @@ HORIZON_S = 5.0  # fact: horizon
 _OFFSETS_S = (0.3, 0.5, 0.8, 1.2, 1.6, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0)
 _AGREEING = 2  # least number of scans that saw a place free
 _IN_A_ROW = 4  # the same, if all scans on one side in time, from the farthest inwards, saw it free
+# Every third scan is looked up first. A place that so many scans saw occupied, and none saw free,
+# is static.
+_EVERY, _SURE = 3, 4
 _CELL_M = 0.35  # points of one object are in neighbouring cells of this size, seen from above
 _MIN_POINTS = 3  # smaller clusters are noise
 _JUDGED_CELL_M = 0.15  # one point per cell of this size is looked up, and decides for the others
@@ -77,6 +82,7 @@ class EvidenceScan:
             none.
         origins: (N, 3) origins of the rays, metres, sensor frame; None: at the sensor. Points with
             one origin follow each other.
+        times: (N,) seconds of the points after the time of the scan; None if they are unknown.
     """
 
     frame: int
@@ -87,6 +93,7 @@ class EvidenceScan:
     labels: LabelArray | None = None
     explained: BoolArray | None = None
     origins: Float32Array | None = None
+    times: AnyFloatArray | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3:
@@ -115,6 +122,7 @@ class FreeSpaceEvidence:
             of static objects.
         world_T_sensor: (4, 4) pose of the scan.
         near: (K,) cells of the points around the sensor that are not ground: see `cells_around`.
+        times: seconds of the `points` after the time of the scan; empty if they are unknown.
     """
 
     frame: int
@@ -127,12 +135,18 @@ class FreeSpaceEvidence:
     around: tuple[int, ...]
     world_T_sensor: Transform
     near: IntArray
+    times: tuple[AnyFloatArray, ...] = ()
 
     def thinned(self, most: int = 400) -> FreeSpaceEvidence:
         """Return the same with at most `most` of the `points` of each cluster; `clusters` stay
         complete.
         """
-        return replace(self, points=tuple(thin(points, most) for points in self.points))
+        if not self.times:
+            return replace(self, points=tuple(thin(points, most) for points in self.points))
+        rows = [spread_rows(len(points), most) for points in self.points]
+        points = tuple(own[kept] for own, kept in zip(self.points, rows, strict=True))
+        times = tuple(own[kept] for own, kept in zip(self.times, rows, strict=True))
+        return replace(self, points=points, times=times)
 
     @property
     def moved(self) -> BoolArray:
@@ -163,7 +177,10 @@ class _Kept:
 
 
 def find_evidence(
-    scans: Iterable[EvidenceScan], *, movable: Collection[int] = ()
+    scans: Iterable[EvidenceScan],
+    *,
+    movable: Collection[int] = (),
+    frames: Collection[int] | None = None,
 ) -> Iterator[FreeSpaceEvidence]:
     """Yield the evidence of each scan of a drive, when the scans of the `HORIZON_S` after it were
     read.
@@ -174,12 +191,18 @@ def find_evidence(
         scans: the scans in order of time. Times that do not increase are replaced by 0.1 s per
             scan.
         movable: classes of actors. Points of different movable classes are not grouped together.
+        frames: only the evidence of these frames is found; None: of all.
 
     Yields:
-        The evidence of each scan, in the order of the scans.
+        The evidence of each of these scans, in their order.
     """
     window: deque[_Kept] = deque()
     current, last = 0, -np.inf
+
+    def found(index: int) -> Iterator[FreeSpaceEvidence]:
+        if frames is None or window[index].scan.frame in frames:
+            yield _evidence(window, index, movable)
+
     for scan in scans:
         seconds = (
             scan.seconds
@@ -191,13 +214,13 @@ def find_evidence(
         # first whose evidence is not given yet. It is complete when a scan lies beyond its horizon.
         window.append(_Kept.of(scan, seconds))
         while window[-1].seconds - window[current].seconds > HORIZON_S:
-            yield _evidence(window, current, movable)
+            yield from found(current)
             current += 1
             while window[current].seconds - window[0].seconds > HORIZON_S:
                 window.popleft()
                 current -= 1
     for index in range(current, len(window)):
-        yield _evidence(window, index, movable)
+        yield from found(index)
 
 
 def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> FreeSpaceEvidence:
@@ -222,10 +245,7 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     groups = _clusters(world, kind, moved, left, static)
     freed = tuple(int((moved | left)[group].sum()) for group in groups)
     clusters = [candidates[group] for group in groups]
-    points = [
-        transform_points(scan.world_T_sensor, scan.points[members].astype(np.float64))
-        for members in clusters
-    ]
+    points = [world[group] for group in groups]
     classes = [
         0 if scan.labels is None else int(np.bincount(scan.labels[own]).argmax())
         for own in clusters
@@ -233,8 +253,9 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     around = _count_around(world, groups, static)
     parts = (tuple(clusters), tuple(points), tuple(classes), freed, around)
     near = cells_around(scan.points[candidates])
+    times = () if scan.times is None else tuple(scan.times[members] for members in clusters)
     return FreeSpaceEvidence(
-        scan.frame, own.seconds, len(scan.points), *parts, scan.world_T_sensor, near
+        scan.frame, own.seconds, len(scan.points), *parts, scan.world_T_sensor, near, times
     )
 
 
@@ -243,6 +264,8 @@ def cells_around(points: AnyFloatArray) -> IntArray:
     indices of a flat array of `OWN_CELLS` along each axis.
     """
     near = points[(np.abs(points) < OWN_REACH_M).all(axis=1)]
+    if not len(near):
+        return np.empty(0, np.int64)
     cells = np.floor(near / OWN_CELL_M).astype(np.int64) + OWN_CELLS // 2
     return np.unique(np.ravel_multi_index(tuple(cells.T), (OWN_CELLS,) * 3, mode="clip"))
 
@@ -286,16 +309,23 @@ def _judge(
     """
     points = np.ascontiguousarray(scan.points[candidates], np.float32)
     free, hit = np.zeros((2, 2, len(points)), np.uint32)
-    asked, left = np.arange(len(points), dtype=np.int32), [len(before), len(after)]
-    while any(left):  # from the farthest inwards: most places are decided before the nearest scans
-        for side, others in enumerate((before, after)):
-            if left[side]:
-                left[side] -= 1
-                other = others[left[side]]
+    asked = np.arange(len(points), dtype=np.int32)
+    left = np.array([(1 << len(before)) - 1, (1 << len(after)) - 1], np.uint32)
+    # From the farthest inwards, first some over the whole time: most places are decided before the
+    # nearest scans.
+    orders = [
+        sorted(range(count), key=lambda bit: ((count - 1 - bit) % _EVERY > 0, -bit))
+        for count in (len(before), len(after))
+    ]
+    for bits in zip_longest(*orders):
+        for side, bit in enumerate(bits):
+            if bit is not None:
+                left[side] &= ~(np.uint32(1) << np.uint32(bit))
+                other = (before, after)[side][bit]
                 pose = as_pose(multiply(invert(other.scan.world_T_sensor), scan.world_T_sensor))
                 for view in other.views:
-                    look_up(points, asked, pose, view, left[side], free[side], hit[side])
-        asked = undecided(asked, free, hit, (left[0], left[1]), (_AGREEING, _IN_A_ROW))
+                    look_up(points, asked, pose, view, bit, free[side], hit[side])
+        asked = undecided(asked, free, hit, left, (_AGREEING, _IN_A_ROW, _SURE))
     seen_through = np.bitwise_count(free).sum(axis=0, dtype=np.int64)
     occupied = np.bitwise_count(hit).sum(axis=0, dtype=np.int64)
     # Bits above the highest hit belong to scans that are farther in time than all hits.
@@ -374,22 +404,41 @@ def _count_around(world: FloatArray, groups: list[IntArray], static: BoolArray) 
     """
     # Row and column in one number, so that neighbours are at fixed steps: 2^20 cells are 367 km.
     cell = np.floor(world[:, :2] / _CELL_M).astype(np.int64) + (1 << 20)
-    key = (cell[:, 0] << 21) | cell[:, 1]
-    rows = np.flatnonzero(static)
+    key, rows = (cell[:, 0] << 21) | cell[:, 1], np.flatnonzero(static)
     rows = rows[np.argsort(key[rows], kind="stable")]
-    keys, heights = key[rows], world[rows, 2]
-    steps = np.array([(row << 21) + column for row in (-1, 0, 1) for column in (-1, 0, 1)])
-    counts = []
-    for group in groups:
-        cells = np.unique(np.unique(key[group])[:, None] + steps)
-        begin, end = np.searchsorted(keys, cells), np.searchsorted(keys, cells, side="right")
-        lower, upper = world[group, 2].min() - _BAND_M, world[group, 2].max() + _BAND_M
-        near = np.concatenate(
-            [heights[a:b] for a, b in zip(begin.tolist(), end.tolist(), strict=True)]
-        )
-        # static points of the group itself count too
-        counts.append(int(((near >= lower) & (near <= upper)).sum()))
-    return tuple(counts)
+    keys, heights, counted = key[rows], world[rows, 2], np.zeros(len(rows), np.int64)
+    return tuple(
+        _count_beside(np.sort(key[group]), world[group, 2], keys, heights, counted, turn)
+        for turn, group in enumerate(groups, 1)
+    )
+
+
+@cached
+def _count_beside(
+    cells: IntArray,
+    inside: FloatArray,
+    keys: IntArray,
+    heights: FloatArray,
+    counted: IntArray,
+    turn: int,
+) -> int:
+    """Return how many points, by their sorted cells and their heights, are in or beside the sorted
+    cells of a group, at the heights of its points; `counted` marks them with the turn of the group.
+    """
+    lower, upper, count = inside.min() - _BAND_M, inside.max() + _BAND_M, 0
+    for k in range(len(cells)):
+        if k and cells[k] == cells[k - 1]:
+            continue
+        for row in (-1, 0, 1):
+            first = cells[k] + (row << 21) - 1
+            at = np.searchsorted(keys, first)
+            while at < len(keys) and keys[at] <= first + 2:
+                # static points of the group itself count too
+                if counted[at] != turn and lower <= heights[at] <= upper:
+                    counted[at] = turn
+                    count += 1
+                at += 1
+    return count
 
 
 _COLUMNS = 1024
@@ -583,8 +632,8 @@ def undecided(
     asked: Int32Array,
     free: Uint32Array,
     hit: Uint32Array,
-    left: tuple[int, int],
-    least: tuple[int, int],
+    left: Uint32Array,
+    least: tuple[int, int, int],
 ) -> Int32Array:
     """Return the points whose result the remaining scans may still change.
 
@@ -593,13 +642,13 @@ def undecided(
         free: (2, M) bits of the scans before and after that saw the place of a point free. Higher
             bits are farther in time.
         hit: (2, M) bits of the scans that saw it occupied.
-        left: number of scans before and after that are not looked up yet, all nearer in time than
-            the others.
-        least: least number of scans that see the place of a moved point free, and of scans in a row
-            if it is free on one side only.
+        left: (2,) bits of the scans before and after that are not looked up yet.
+        least: least number of scans that see the place of a moved point free, of scans in a row if
+            it is free on one side only, and of scans that saw a place occupied which none saw free:
+            such a place is decided.
     """
     kept = np.empty_like(asked)
-    count, rest = 0, left[0] + left[1]
+    count, rest = 0, _count(np.int64(left[0])) + _count(np.int64(left[1]))
     for i in asked:
         passed = _count(np.int64(free[0, i])) + _count(np.int64(free[1, i]))
         occupied = _count(np.int64(hit[0, i])) + _count(np.int64(hit[1, i]))
@@ -612,9 +661,9 @@ def undecided(
             # All bits below the highest hit are set, in five steps: 2^5 = 32 bits.
             for shift in (1, 2, 4, 8, 16):
                 h |= h >> shift
-            in_a_row = _count(np.int64(free[side, i]) & ~h) + (left[side] if h == 0 else 0)
+            in_a_row = _count(np.int64(free[side, i] | left[side]) & ~h)
             may_change = may_change or in_a_row >= least[1]
-        if may_change and not moves:
+        if may_change and not moves and (passed or occupied < least[2]):
             kept[count] = i
             count += 1
     return kept[:count]

@@ -115,8 +115,9 @@ class ActorFollower:
         self.moved[scan.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
         self._poses.append(scan.world_T_sensor)
         self._near[scan.near] += 1
+        sensor_T_world = invert(scan.world_T_sensor)
         for members, points in zip(scan.clusters, scan.points, strict=True):
-            local = transform_points(invert(scan.world_T_sensor), points)
+            local = transform_points(sensor_T_world, points)
             cells = cells_around(local)
             self._freed[cells] += 1
             if len(cells) and np.abs(local).max() < OWN_REACH_M:
@@ -192,7 +193,10 @@ class _Link:
         points = evidence.points[index]
         pose, freed, around = evidence.world_T_sensor, evidence.freed[index], evidence.around[index]
         members, label = evidence.clusters[index], evidence.labels[index]
-        segment = Segment(evidence.frame, label, members, points, None, origin=pose[:3, 3])
+        times = evidence.times[index] if evidence.times else None
+        segment = Segment(
+            evidence.frame, label, members, points, None, origin=pose[:3, 3], times=times
+        )
         return cls(
             evidence.seconds, segment, points.min(axis=0), points.max(axis=0), freed, around, pose
         )
@@ -208,10 +212,14 @@ class _Link:
 
     def joined(self, other: _Link) -> _Link:
         """Return the two as one observation."""
+        one, more = self.segment, other.segment
         segment = replace(
-            self.segment,
-            members=np.concatenate([self.segment.members, other.segment.members]),
-            points=np.concatenate([self.segment.points, other.segment.points]),
+            one,
+            members=np.concatenate([one.members, more.members]),
+            points=np.concatenate([one.points, more.points]),
+            times=None
+            if one.times is None or more.times is None
+            else np.concatenate([one.times, more.times]),
         )
         lower, upper = np.minimum(self.lower, other.lower), np.maximum(self.upper, other.upper)
         freed, around = self.freed + other.freed, self.around + other.around
@@ -247,31 +255,6 @@ class _ActorChain:
         least = np.take_along_axis(slopes, np.abs(slopes).argmin(axis=0)[None], axis=0)[0]
         return np.where(np.abs(slopes).max(axis=0) > 0, (least + slopes[1]) / 2, 0.0)
 
-    def cost(self, link: _Link) -> float | None:
-        """Return how badly an observation continues the chain; None if it cannot."""
-        last, velocity = self.last, self.velocity
-        if last.segment.label != link.segment.label:
-            return None
-        elapsed = link.seconds - last.seconds
-        shift = np.zeros(3) if velocity is None else velocity * elapsed
-        gap = np.maximum(
-            np.maximum(last.lower + shift - link.upper, link.lower - last.upper - shift), 0.0
-        )
-        offset = link.middle - last.middle - shift
-        reach = _REACH_M + (min(_MAX_SPEED_M_S * elapsed, 4.0) if velocity is None else 0.0)
-        if (
-            np.linalg.norm(gap[:2], axis=0) > reach
-            or abs(gap[2]) > _REACH_M
-            or np.linalg.norm(offset[:2], axis=0) > 3 * reach + 2.0
-        ):
-            return None
-        sizes = np.abs((link.upper - link.lower) - (last.upper - last.lower))
-        return float(
-            np.linalg.norm(gap, axis=0)
-            + 0.3 * np.linalg.norm(offset[:2], axis=0)
-            + 0.2 * sizes.sum()
-        )
-
     def covers(self, link: _Link) -> bool:
         """Return whether an observation is inside the place that is expected of the next one."""
         velocity = self.velocity
@@ -293,8 +276,13 @@ class _ActorChain:
         label = int(votes.argmax()) or default_label
         sizes = np.quantile([link.upper - link.lower for link in self.links], 0.8, axis=0)
         rigid = label not in deformable if votes.argmax() and deformable else not _is_small(sizes)
-        samples = [thin(s.points, _SAMPLES) for s in segments]
-        positions, velocities, headings = estimate_path(samples, seconds, rigid=rigid)
+        thinned = [segment.thinned(_SAMPLES) for segment in segments]
+        samples = [segment.points for segment in thinned]
+        delays = [s.times for s in thinned] if thinned[0].times is not None else None
+        positions, velocities, headings = estimate_path(
+            samples, seconds, rigid=rigid, delays=delays
+        )
+        samples = [few.at_frame(v).points for few, v in zip(thinned, velocities, strict=True)]
         speeds = np.linalg.norm(velocities[:, :2], axis=1)
         if (
             np.ptp(positions[:, :2], axis=0).max() < _MIN_PATH_M
@@ -314,7 +302,7 @@ class _ActorChain:
         if confidence < _LEAST_CONFIDENCE:
             return None
         parts = [
-            replace(segment, label=label, velocity=velocity, instance=instance)
+            replace(segment.at_frame(velocity), label=label, velocity=velocity, instance=instance)
             for segment, velocity in zip(segments, velocities, strict=True)
         ]
         return FoundActor(tuple(parts), rigid, confidence)
@@ -409,26 +397,27 @@ def _join_parts(links: list[_Link], deformable: Collection[int]) -> list[_Link]:
 
     Rays that meet a side at a grazing angle are far apart, and split it.
     """
-    joined = list(links)
-    i = 0
+    joined, i = list(links), 0
+    lower, upper = (
+        np.array([getattr(link, name) for link in links]) for name in ("lower", "upper")
+    )
     while i < len(joined):
-        j = i + 1
-        while j < len(joined):
-            if _are_parts(joined[i], joined[j], deformable):
-                joined[i] = joined[i].joined(joined.pop(j))
-                j = i + 1
-            else:
-                j += 1
-        i += 1
+        gaps = np.maximum(lower[i] - upper[i + 1 :], lower[i + 1 :] - upper[i])
+        near = np.flatnonzero((gaps <= _PARTS_M).all(axis=1)) + i + 1
+        parts = (j for j in near.tolist() if _are_parts(joined[i], joined[j], deformable))
+        j = next(parts, None)
+        if j is None:
+            i += 1
+            continue
+        joined[i] = joined[i].joined(joined.pop(j))
+        lower, upper = np.delete(lower, j, axis=0), np.delete(upper, j, axis=0)
+        lower[i], upper[i] = joined[i].lower, joined[i].upper
     return joined
 
 
 def _are_parts(one: _Link, other: _Link, deformable: Collection[int]) -> bool:
     label = one.segment.label
-    if (
-        label != other.segment.label
-        or (np.maximum(one.lower - other.upper, other.lower - one.upper) > _PARTS_M).any()
-    ):
+    if label != other.segment.label:
         return False
     if label in deformable or (not (label and deformable) and one.is_small and other.is_small):
         return False
@@ -445,14 +434,7 @@ def _link(
     links = _join_parts(
         [_Link.of(evidence, index) for index in range(len(evidence.clusters))], deformable
     )
-    costs = []
-    ends = np.array([chain.last.middle for chain in alive]).reshape(-1, 3)
-    for i, link in enumerate(links):
-        for j in np.flatnonzero(np.abs(ends - link.middle).max(axis=1) < _FAR_M).tolist():
-            cost = alive[j].cost(link)
-            if cost is not None:
-                costs.append((cost, i, j))
-    taken = best_pairs(costs)
+    taken = best_pairs(_costs(links, alive) if alive else [])
     extra = {
         i: j
         for i in range(len(links))
@@ -467,3 +449,33 @@ def _link(
     for i, j in taken.items():
         alive[j].append(links[i])
     alive.extend(fresh)
+
+
+def _costs(links: list[_Link], alive: list[_ActorChain]) -> list[tuple[float, int, int]]:
+    """Return how badly each observation continues each chain that it can continue, with the numbers
+    of both.
+    """
+    ends = [chain.last for chain in alive]
+    label = np.array([end.segment.label for end in ends])
+    seconds = np.array([end.seconds for end in ends])
+    lower, upper = (np.stack([getattr(end, name) for end in ends]) for name in ("lower", "upper"))
+    middle, size = (lower + upper) / 2, upper - lower
+    fresh = np.array([chain.velocity is None for chain in alive])
+    velocity = np.stack(
+        [np.zeros(3) if chain.velocity is None else chain.velocity for chain in alive]
+    )
+    costs = list[tuple[float, int, int]]()
+    for i, link in enumerate(links):
+        elapsed = link.seconds - seconds
+        shift = velocity * elapsed[:, None]
+        gap = np.maximum(np.maximum(lower + shift - link.upper, link.lower - upper - shift), 0.0)
+        offset = link.middle - middle - shift
+        reach = _REACH_M + np.where(fresh, np.minimum(_MAX_SPEED_M_S * elapsed, 4.0), 0.0)
+        aside = np.linalg.norm(offset[:, :2], axis=1)
+        can = (label == link.segment.label) & (np.abs(middle - link.middle).max(axis=1) < _FAR_M)
+        can &= (np.linalg.norm(gap[:, :2], axis=1) <= reach) & (gap[:, 2] <= _REACH_M)
+        can &= aside <= 3 * reach + 2.0
+        sizes = np.abs((link.upper - link.lower) - size).sum(axis=1)
+        cost = np.linalg.norm(gap, axis=1) + 0.3 * aside + 0.2 * sizes
+        costs += [(float(cost[j]), i, j) for j in np.flatnonzero(can).tolist()]
+    return costs

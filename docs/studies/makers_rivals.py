@@ -351,6 +351,7 @@ RIVALS = {
                 (0.4, 0.4, 1),
             )
         ),
+        best=8,
         module="dufomap",
     ),
     "dynamic-object-removal, then `tube`": Rival(
@@ -368,6 +369,7 @@ RIVALS = {
             {"cleaners": {"scan_ratio": {}}},
             {"cleaners": {"scan_ratio": {"min_votes": 2}}},
         ),
+        best=7,
         module="dynamic_object_removal",
     ),
     "OctoMap": Rival(
@@ -386,6 +388,7 @@ RIVALS = {
                 (0.95, 0.4, 0.5),
             )
         ),
+        best=3,
         module="pyoctomap",
     ),
     "SurroundOcc's recipe": Rival("classes, boxes", surroundocc),
@@ -395,9 +398,9 @@ RIVALS = {
         tuple(
             {"miss": miss, "false": false}
             for miss, false in (
+                (0.95, 0.2),
                 (0.8, 0.2),
                 (0.9, 0.2),
-                (0.95, 0.2),
                 (0.9, 0.05),
                 (0.95, 0.05),
                 (0.8, 0.05),
@@ -408,6 +411,7 @@ RIVALS = {
                 (0.99, 0.3),
             )
         ),
+        best=10,
     ),
     "ours, flow": Rival("classes, flow", ours, ({"motion": "flow"},)),
     "ours, instances": Rival("classes, instances", ours, ({"motion": "instances"},)),

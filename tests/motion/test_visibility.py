@@ -121,11 +121,21 @@ def test_places_that_are_decided_keep_their_verdict_whatever_the_other_scans_say
     free, hit = (((bits == kind) * weights).sum(axis=1).astype(np.uint32) for kind in (1, 2))
     whole, asked, saved = verdicts(free, hit, 2, 4), np.arange(400, dtype=np.int32), 0
     seen_free, seen_hit = np.zeros_like(free), np.zeros_like(hit)
-    for left in range(11, -1, -1):  # from the farthest inwards
-        bit = np.uint32(1 << left)
+    rest = np.full(2, (1 << 12) - 1, np.uint32)
+    for left, place in zip(range(11, -1, -1), rng.permutation(12).tolist(), strict=True):
+        bit = np.uint32(1 << place)
+        rest &= ~bit
         seen_free[:, asked] |= free[:, asked] & bit
         seen_hit[:, asked] |= hit[:, asked] & bit
-        asked = undecided(asked, seen_free, seen_hit, (left, left), (2, 4))
+        asked = undecided(asked, seen_free, seen_hit, rest, (2, 4, 25))
         saved += (400 - len(asked)) if left else 0
     assert verdicts(seen_free, seen_hit, 2, 4) == whole
     assert saved > 400
+
+
+def test_a_place_that_four_scans_saw_occupied_and_none_free_is_decided():
+    free, hit = np.zeros((2, 2, 3), np.uint32)
+    hit[:, :2], hit[1, 1], free[0, 2], hit[:, 2] = 0b110, 0b100, 0b1000, 0b110
+    left, asked = np.full(2, 0b1, np.uint32) << np.uint32(11), np.arange(3, dtype=np.int32)
+    left |= np.uint32(0b11111110000)
+    assert undecided(asked, free, hit, left, (2, 4, 4)).tolist() == [1, 2]

@@ -52,7 +52,7 @@ TRACKS, POSES = "tracks", "poses"
 
 # of the methods: a version changes only when the same input gives another result
 _VERSIONS = {
-    TRACKS: 6,
+    TRACKS: 8,
     POSES: 2,
 }
 _NOTED_M = 0.04  # if scans disagree by more and poses do not change, there is a note
@@ -80,11 +80,8 @@ def _find_evidence(
     scans = map(partial(feed.evidence_scan, boxes=boxes), near)
     # labels that are often wrong must not split actors
     movable = feed.classes.movable if feed.trusts_ground_labels else ()
-    chosen, found = set(block), list[FreeSpaceEvidence]()
-    for one in find_evidence(scans, movable=movable):
-        if one.frame in chosen:
-            found.append(one.thinned())
-    return found
+    found = find_evidence(scans, movable=movable, frames=frozenset(block))
+    return [evidence.thinned() for evidence in found]
 
 
 def _make_track(actor: _Observed, times: dict[int, float], deformable: frozenset[int]) -> Track:

@@ -284,13 +284,16 @@ class _AddScans:
         if feed.must_find_ground:  # ground that was found had a class for the votes only
             labels[np.isin(labels, sorted(feed.classes.ground))] = feed.classes.geometry_id
         world = transform_points(scan.world_T_sensor, scan.points.astype(np.float64))
+        settled = merger.settled(frame).points if self.actors else scan.points
         chosen: list[tuple[int, AnyArray, FloatArray]] = [
             (STATIC, np.flatnonzero(static), world[static])
         ]
         for number, track in merger.actors.tracks.items() if self.actors else ():
             members, pose = track.members.get(frame), track.pose(frame)
             if members is not None and pose is not None:
-                chosen.append((number, members, transform_points(invert(pose), world[members])))
+                own = settled[members].astype(np.float64)
+                actor_T_sensor = invert(pose) @ scan.world_T_sensor
+                chosen.append((number, members, transform_points(actor_T_sensor, own)))
         for group, points, places in chosen:
             right = places * (1, -1, 1) if feed.sequence.metadata.axes == "left" else places
             sure = None if scan.sure is None else scan.sure[points]
