@@ -60,7 +60,7 @@ _INSIDE_M, _SAME_M = 22.0, 0.15
 _SHARE, _AMBIGUOUS, _OTHER_M = 0.45, 0.85, 0.5
 _DETERMINED, _FEWEST, _ROUGH_M = 0.02, 12.0, 0.06
 # Errors of a motion over a submap, and of a loop, metres and radians.
-_UNKNOWNS = 300  # most submaps without loops whose poses are unknown
+_UNKNOWNS = 200  # most loops that count, and most submaps without loops whose poses are unknown
 _ODOMETRY = np.array([0.02, 0.02, 0.02, 0.0007, 0.0007, 0.0007])
 _LOOP = np.array([0.01, 0.01, 0.01, 0.0003, 0.0003, 0.0003])
 _TOGETHER_M, _AGREE_M, _AGREE_RAD = 60.0, 0.25, np.radians(0.5)
@@ -207,6 +207,7 @@ def close_loops(submaps: Sequence[Submap], poses: FloatArray) -> tuple[FloatArra
     loops = _agreeing(submaps, [loop for pair in _pairs(submaps) for loop in _lay(submaps, *pair)])
     if not loops:
         return poses, np.empty((0, 4))
+    loops = loops[:: -(-len(loops) // _UNKNOWNS)]
     # Of a long drive without loops, some submaps are enough: the system has few unknowns.
     every = range(0, len(submaps), -(-len(submaps) // _UNKNOWNS))
     chosen = sorted({*every, len(submaps) - 1, *(end for loop in loops for end in loop[:2])})
@@ -459,7 +460,7 @@ def _solve(
     ]
     while loops:
         solved = start.copy()
-        for _ in range(5):
+        for _ in range(3):
             matrix, right = np.zeros((6 * len(start),) * 2), np.zeros(6 * len(start))
             matrix[np.arange(6), np.arange(6)] = 1e12  # the first pose stays
             for (i, j, motion), error in [*steps, *((loop, _LOOP) for loop in loops)]:
@@ -473,7 +474,9 @@ def _solve(
         off = [float((one / limits).max()) for one in left]
         if max(off) < 1.0:
             return loops, solved
-        loops = [loop for loop, value in zip(loops, off, strict=True) if value < max(off)]
+        loops = [
+            loop for loop, value in zip(loops, off, strict=True) if value < max(1.0, max(off) / 2)
+        ]
     return loops, start
 
 

@@ -249,11 +249,15 @@ def refine_poses(
 def _may_return(given: FloatArray) -> bool:
     """Return whether a drive may come near a place again that it has left."""
     steps = np.sqrt(np.square(np.diff(given[:, :3, 3], axis=0)).sum(axis=1))
-    along = np.append(0.0, np.cumsum(steps))
+    along = np.append(0.0, np.cumsum(steps))[: len(given)]
     rows = np.flatnonzero(np.diff(along // _SPARSE_M, prepend=-1.0))
-    gap, off = (values[:, None] - values for values in (along[rows], given[rows, :2, 3]))
-    near = np.hypot(off[..., 0], off[..., 1]) < _AROUND_M + _ASTRAY * gap
-    return bool((near & (gap > _GONE_M)).any())
+    along, places = along[rows], given[rows, :2, 3]
+    for i in range(len(rows)):
+        gap, off = along[i] - along[:i], places[i] - places[:i]
+        near = np.hypot(off[:, 0], off[:, 1]) < _AROUND_M + _ASTRAY * gap
+        if (near & (gap > _GONE_M)).any():
+            return True
+    return False
 
 
 def _is_better(before: FloatArray, after: FloatArray) -> bool:
