@@ -143,8 +143,8 @@ def main() -> None:
     with study.begin(parser) as given:
         asked = [tuple(one.split(":")) for one in given.drives] or study.few(DRIVES)
         print(
-            "| drive | channels | metres | loops | KISS-ICP | refined | with loops | walls before "
-            "| walls after |\n|---|" + "---:|" * 8
+            "| drive | loops | KISS-ICP | refined | with loops | walls before, after |\n|---|"
+            + "---:|" * 5
         )
         for route, *numbers in asked:
             seed, channels, every = map(int, numbers)
@@ -162,7 +162,8 @@ def main() -> None:
             ]
             walls = [f"{thicker(drive, one.poses, pairs):.2f}" for one in made]
             length = np.linalg.norm(np.diff(drive.true[:, :3, 3], axis=0), axis=1).sum()
-            cells = [route, channels // every, f"{length:.0f}", len(made[1].loops), *off, *walls]
+            about = f"{route}, {length:.0f} m, {channels // every} channels"
+            cells = [about, len(made[1].loops), *off, ", ".join(walls)]
             print("| " + " | ".join(map(str, cells)) + " |", flush=True)
 
 
