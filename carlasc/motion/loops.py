@@ -34,13 +34,8 @@ from carlasc.motion.planes import covariances
 from carlasc.motion.solving import principal_axes, solve_positive
 
 _STEP_M, _SUBMAP_M, _REACH_M = 1.0, 10.0, 30.0  # between used scans; length; of points, sideways
-_CELL_M, _POINTS, _FLAT, _THICK_M, _WIDE_M2 = (
-    1.0,
-    10,
-    0.1,
-    0.08,
-    0.02,
-)  # of a plane: see `SubmapPlanes`
+# Of a plane: see `SubmapPlanes`.
+_CELL_M, _POINTS, _FLAT, _THICK_M, _WIDE_M2 = 1.0, 10, 0.1, 0.08, 0.02
 _PIXEL_M, _PIXELS, _LEVELS = 0.5, 256, 3  # of images: pixels with points at so many levels
 _APART_M, _NEAR_M, _PASSES = 60.0, 12.0, 3  # of two submaps: along the drive; away; passes tried
 # What poses may be off, per metre of the drive between two submaps, and at least; less in height,
@@ -48,10 +43,7 @@ _APART_M, _NEAR_M, _PASSES = 60.0, 12.0, 3  # of two submaps: along the drive; a
 _DRIFT, _DRIFT_M, _MOST_M = 0.01, 1.0, 30.0
 _CLIMB, _COVERED_M = 0.001, 1.2  # of the height: a ramp looks like the one above it
 _TURN, _TURN_RAD, _MOST_RAD = np.radians(0.005), np.radians(1.0), np.radians(12.0)
-_YAW_RAD, _MARGIN_M = (
-    np.radians(0.75),
-    8.0,
-)  # steps of directions; other positions that are looked at
+_YAW_RAD, _MARGIN_M = np.radians(0.75), 8.0  # steps; other positions that are looked at
 _PEAKS, _PEAK_M, _PEAK = 5, 1.5, 0.6
 _GATES_M = (1.0, 1.0, 1.0, 0.7, 0.7, 0.5, 0.5, 0.35, 0.35, 0.25, 0.25, 0.2, 0.2, 0.2)
 _ALIKE, _SIDEWAYS_M = 0.9, 1.5  # cosine between normals, and distance along planes
