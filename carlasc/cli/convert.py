@@ -106,6 +106,22 @@ def convert(
             "ones). voxels: the grids of the data set. none: no grids."
         ),
     ] = "scans",
+    follow: Annotated[
+        bool,
+        typer.Option(
+            "--follow",
+            help="SOURCE is a folder of scans that grows: take scans as they appear, and make "
+            "provisional grids, until Ctrl-C or --idle. Then all is made as without this option.",
+        ),
+    ] = False,
+    idle: Annotated[
+        float | None,
+        typer.Option(
+            help="With --follow: seconds without a new scan after which the drive has ended. "
+            "Default: it ends with Ctrl-C.",
+            min=1.0,
+        ),
+    ] = None,
     dry_run: Annotated[
         bool,
         typer.Option("--dry-run", help="Print what would be read and written, and write nothing."),
@@ -162,6 +178,25 @@ def convert(
         making.votes.make(),
         follow_ground=not bounded,
     )
+    if follow:
+        if run.part or run.sequences_from or run.cluster or chosen or "frames" in written.values:
+            raise ArgumentError(
+                "--follow",
+                expected="one recording, whole, on this machine",
+                found="--part, --sequences-from, --cluster, --sequences or --frames",
+            )
+        carlasc.converting.follow(
+            name,
+            source,
+            out,
+            idle_s=idle,
+            layout=layout.make(),
+            poses=poses.make(),
+            grids=made if grids == "scans" else None,
+            options=options.values,
+            run=carlasc.Run(run.workers),
+            say=lambda line: echo(line, err=True),
+        )
     with run.spread(f"convert {name}", "steps") as spread:
         result = written.make(
             name,

@@ -60,7 +60,7 @@ TABLE = {
     "carlasc.evaluate": Shown(hidden="convention name"),
     "carlasc.export": Shown(hidden="sequences"),
     "carlasc.map": Shown(renamed={"cell_m": "--cell"}),
-    "carlasc.MapExtras": Shown(files="mesh distance trajectory"),
+    "carlasc.MapExtras": Shown(files="mesh distance trajectory boxes_out"),
     "carlasc.RecordingOptions": Shown("Recordings", hidden="options", files="keep"),
     "carlasc.motion.MotionOptions": Shown(
         "Scans merged over time", hidden="min_speed_m_s", renamed={"source": "--motion"}

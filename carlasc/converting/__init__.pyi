@@ -8,6 +8,7 @@ from .exporter import SequenceExporter as SequenceExporter
 from .exporter import SequenceFile as SequenceFile
 from .exporting import ExportResult as ExportResult
 from .exporting import export as export
+from .following import follow as follow
 from .mapping import MapExtras as MapExtras
 from .mapping import MapResult as MapResult
 from .mapping import RecordingOptions as RecordingOptions

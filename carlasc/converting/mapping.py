@@ -44,12 +44,15 @@ class MapExtras:
         distance: with `grid`: .npz file of the distance of each voxel from the surface.
         trajectory: file of the pose of the sensor in the map at each scan, in the format of TUM:
             seconds since the first frame, position, quaternion x, y, z, w.
+        boxes_out: .csv or .json file of the boxes of the moving actors: one row per actor and
+            scan, in the frame of the map.
     """
 
     actors: bool = False
     mesh: AnyPath | None = None
     distance: AnyPath | None = None
     trajectory: AnyPath | None = None
+    boxes_out: AnyPath | None = None
 
     def __post_init__(self) -> None:
         check_types(MapExtras, vars(self))
@@ -164,8 +167,8 @@ def map(
         )
     if run.part.count > 1:
         raise ArgumentError("part", expected="none, as a map is one file", found=str(run.part))
-    extra = {"mesh": extras.mesh, "distance": extras.distance, "trajectory": extras.trajectory}
-    files = MapFiles.of({"out": out, **extra}, extras.actors, grid)
+    given_files = {name: path for name, path in vars(extras).items() if name != "actors"}
+    files = MapFiles.of({"out": out, **given_files}, extras.actors, grid)
     wanted, keep, options = FrameRange.of(frames), recording.keep, recording.options
     root, reader = None, None
     if (

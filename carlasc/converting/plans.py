@@ -54,6 +54,7 @@ from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
+from carlasc.storage.inputs import PROVISIONAL, MadeFrom
 from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import SequenceWriter, Sink
 from carlasc.storage.resuming import agree_lines, agree_metadata, check_grid
@@ -62,6 +63,8 @@ if TYPE_CHECKING:
     from carlasc.motion.odometry import UsableScan
 
 FILE, KISS_ICP = "file", "kiss-icp"
+CONVERSION = "conversion"
+"""Name of the record of what the scans of an output were converted from."""
 _ESTIMATE = 'estimate poses from the scans with `poses="kiss-icp"`'
 _ACCEPT = "accept them as they are with `force=True`"
 # fourth differences, which are nearly 0 for a vehicle
@@ -231,6 +234,11 @@ def choose_recordings(
             empty[0].location, expected="scans", found="none", advice="copy them"
         )
     return chosen
+
+
+def is_provisional(writer: SequenceWriter) -> bool:
+    """Whether an output was written while its recording grew."""
+    return MadeFrom.read(writer, CONVERSION).whole == PROVISIONAL
 
 
 def sequence_path(recording: Recording) -> str:
@@ -426,7 +434,8 @@ def plan_recording(
         ConflictError: the output has another grid in the place of the voxels.
     """
     writer = sink.sequence(sequence_path(recording))
-    known = options.force or writer.read_document(layout.POSES) is not None
+    grew = is_provisional(writer)
+    known = options.force or (writer.read_document(layout.POSES) is not None and not grew)
     seen = examine(recording, converter, options, frames=frames, level=output.level, known=known)
     if problem := next((one for one in seen.findings if one.severity == "error"), None):
         raise FormatError(

@@ -18,10 +18,12 @@ import numpy as np
 from carlasc.converting.assembling import LayoutOptions
 from carlasc.converting.clips import convert_clips
 from carlasc.converting.plans import (
+    CONVERSION,
     KISS_ICP,
     RecordingPlan,
     SplitName,
     choose_recordings,
+    is_provisional,
     plan_recording,
     sequence_path,
 )
@@ -32,6 +34,7 @@ from carlasc.core.choices import CompareInputs
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError, check_choice, check_types
+from carlasc.groundtruth.inputs import remove_provisional
 from carlasc.groundtruth.options import FromScans, GridOptions, Voting, fit_to_ground, fit_to_reach
 from carlasc.groundtruth.run import regrid
 from carlasc.inspection.findings import Finding
@@ -41,20 +44,20 @@ from carlasc.running.processes import one_pool
 from carlasc.running.spreading import Part, Run, StepCounter
 from carlasc.storage.files import AnyPath
 from carlasc.storage.inputs import (
+    PROVISIONAL,
     MadeFrom,
     changed_names,
     combined,
     folder_states,
     made_again,
 )
-from carlasc.storage.layout import Metadata, place_of
+from carlasc.storage.layout import METADATA, Metadata, place_of
 from carlasc.storage.opening import as_sink
 from carlasc.storage.protocol import Sequence, Sink, Source
 from carlasc.storage.transport.remote_tree import check_shared
 from carlasc.storage.transport.trees import LocalTarget
 
 Grids = GridOptions | Literal["voxels"] | None
-_RECORD = "conversion"
 _GAP = "gap"  # in the record: a frame that failed, and others were finished without it
 _UNKNOWN = "there was no record of what frames were made from, so all were compared"
 _LOOKED_AT = (
@@ -165,7 +168,7 @@ def convert(
     converter = open_converter(name, root, options)
     target, sink = layout.of(converter), as_sink(out, part=run.part)
     check_shared(sink.location, run)
-    _check(root, sink, split, grids)
+    check_arguments(root, sink, split, grids)
     compare = layout.compare_inputs
     found = find_recordings(converter)
     recordings = _deal(choose_recordings(found, root, sequences, split), run.part)
@@ -187,11 +190,7 @@ def convert(
         own = None if states is None else states[None] | states.get(plan.recording.location, {})
         records.append(_ConvertedFrom(plan, own))
         records[-1].begin(compare)
-    origin = f"{name if isinstance(name, str) else name.__name__} {root.name}"
-    ranges = converter.min_range_m, converter.max_range_m
-    said = {name: getattr(converter, name) for name in ("license", "citation", "simulated")}
-    known = {key: value for key, value in said.items() if value not in (None, False)}
-    metadata = Metadata(layout.axes, target.classes, converter.sensor, *ranges, origin, known)
+    metadata = describe(converter, name, layout)
 
     every = sum(len(plan.recording.frames) for plan in plans)
     in_grids = every if isinstance(grids, GridOptions) else 0
@@ -216,7 +215,7 @@ def convert(
             converted = [one for one in conversions if one.has_scans and not one.waits]
             if converted:  # otherwise every frame failed, and is reported
                 scans = _ConvertedScans(sink, converted)
-                spec, observe, cut = _plan_grids(grids, converted, scans, poses)
+                spec, observe, cut = plan_grids(grids, converted, scans, poses)
                 voting = grids.voting or Voting()
                 made = regrid(
                     scans,
@@ -228,6 +227,8 @@ def convert(
                     run=alone,
                 )
                 made = replace(made, notes=(*cut, *made.notes))
+                for sequence in scans.values():
+                    remove_provisional(sink.sequence(sequence.path), sequence)
 
     failures = [failure for conversion in conversions for failure in conversion.failures]
     notes = [note for record in records for note in record.notes]
@@ -245,6 +246,16 @@ def convert(
         tuple(finding for plan in plans for finding in plan.findings),
         time.perf_counter() - start,
     )
+
+
+def describe(converter: Converter, name: str | type[Converter], layout: LayoutOptions) -> Metadata:
+    """Return the entries of carlasc.json that all recordings of a converter share."""
+    origin = f"{name if isinstance(name, str) else name.__name__} {converter.source.name}"
+    ranges = converter.min_range_m, converter.max_range_m
+    said = {name: getattr(converter, name) for name in ("license", "citation", "simulated")}
+    known = {key: value for key, value in said.items() if value not in (None, False)}
+    classes = layout.of(converter).classes
+    return Metadata(layout.axes, classes, converter.sensor, *ranges, origin, known)
 
 
 def _joined(results: Series[ConvertResult | Failure], elapsed_s: float) -> ConvertResult:
@@ -283,7 +294,11 @@ class _ConvertedFrom:
         frames are made again.
         """
         plan, states = self.plan, self.states
-        self._before = before = MadeFrom.read(plan.writer, _RECORD)
+        self._before = before = MadeFrom.read(plan.writer, CONVERSION)
+        if is_provisional(plan.writer):
+            plan.make_again(is_same=True)
+            plan.writer.remove_document(METADATA)  # may name another source of poses
+            return
         if states is None:
             return
         exists = bool(before.own) or len(plan.missing) < len(plan.recording.frames)
@@ -298,8 +313,11 @@ class _ConvertedFrom:
         if self.plan.again:
             before, where = self._before, self.plan.writer.location
             conversion.remove_others(map(int, before.frames))
-            if conversion.changed or not before.own:
+            if before.whole == PROVISIONAL:
+                why = "they were provisional"
+            else:
                 why = changed_names(before.own, self.states or {}) if before.own else _UNKNOWN
+            if conversion.changed or why == _UNKNOWN:
                 self.notes.append(f"{where}: {made_again(conversion.changed, why)}")
         has_gaps = conversion.allow_gaps or self.plan.pose_source == KISS_ICP
         self._write(conversion.failed if has_gaps else ())
@@ -310,7 +328,9 @@ class _ConvertedFrom:
             own = dict(self.states)
             numbers = [handle.number for handle in self.plan.recording.frames]
             frames = {str(number): _GAP if number in gaps else "done" for number in numbers}
-            MadeFrom(combined(sorted(own.items())), own, frames).write(self.plan.writer, _RECORD)
+            MadeFrom(combined(sorted(own.items())), own, frames).write(self.plan.writer, CONVERSION)
+        elif self._before.whole == PROVISIONAL:
+            MadeFrom().write(self.plan.writer, CONVERSION)
 
 
 def source_states(
@@ -352,7 +372,7 @@ class _ConvertedScans(Source):
         return chosen
 
 
-def _plan_grids(
+def plan_grids(
     grids: GridOptions, conversions: Series[Conversion], scans: Source, poses: PoseOptions
 ) -> tuple[GridSpec, FromScans, list[str]]:
     """Return the grid of the converted sequences, how scans are merged, and notes for the user.
@@ -429,7 +449,7 @@ def _deal(recordings: Series[Recording], part: Part) -> list[Recording]:
     return [recordings[index] for index in np.flatnonzero(shares == part.number - 1).tolist()]
 
 
-def _check(source: Path, sink: Sink, split: str, grids: Grids) -> None:
+def check_arguments(source: Path, sink: Sink, split: str, grids: Grids) -> None:
     """Check the arguments, before recordings are searched for.
 
     Raises:

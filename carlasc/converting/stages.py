@@ -309,7 +309,7 @@ class Conversion:
         if plan.poses is not None:
             write_poses(plan, self.target)
         self._finish(velocities)
-        self._find_ground()
+        self.find_ground()
         self.failures += [
             Failure(plan.recording.location, *problem) for problem in plan.recording.problems()
         ]
@@ -587,7 +587,7 @@ class Conversion:
         times = {number: float(plan.times[number]) for number in numbers}
         return tracks_from_boxes(boxes, poses, times), boxes
 
-    def _find_ground(self) -> None:
+    def find_ground(self) -> None:
         """Find the ground in some of the scans; write the height of the sensor if the data set
         does not say it, and what was found.
         """

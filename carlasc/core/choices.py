@@ -29,6 +29,9 @@ PoseSource = Literal["auto", "file", "kiss-icp"]
 RefineMode = Literal["auto", "always", "never"]
 """When poses are refined."""
 
+LoopMode = Literal["auto", "never"]
+"""Whether places that are met again join the poses of a drive."""
+
 MotionSource = Literal["auto", "boxes", "instances", "flow", "evidence", "none"]
 """How moving points are found."""
 

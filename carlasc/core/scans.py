@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import reduce
+from operator import or_
 from typing import Any
 
 import numpy as np
@@ -137,17 +139,20 @@ class Scan:
 
 
 def sorted_by_origin(origins: AnyFloatArray) -> IntArray:
-    """Return (N,) indices that sort points by their (N, 3) origins. The sort is stable."""
+    """Return (N,) indices that sort points by their (N, 3) origins, or (N, 4) origins and times.
+
+    The sort is stable.
+    """
     starts = _starts(origins)
     group = np.unique(origins[starts], axis=0, return_inverse=True)[1].reshape(-1)
     return np.argsort(np.repeat(group, np.diff([*starts, len(origins)])), kind="stable")
 
 
 def runs_of_origins(origins: AnyFloatArray | None, count: int) -> list[tuple[slice, AnyFloatArray]]:
-    """Return the runs of consecutive points with equal origins, and the (3,) origin of each run.
+    """Return the runs of consecutive points with equal origins, and the row of each run.
 
     Args:
-        origins: (N, 3) metres; None if all rays begin at (0, 0, 0).
+        origins: (N, 3) metres, or (N, 4) with times; None if all rays begin at (0, 0, 0).
         count: number of points.
     """
     if origins is None or not count:
@@ -159,8 +164,7 @@ def runs_of_origins(origins: AnyFloatArray | None, count: int) -> list[tuple[sli
 def _starts(origins: AnyFloatArray) -> IntArray:
     """Return where each run of equal rows begins."""
     # five times as fast column by column as row by row
-    x, y, z = (axis[1:] != axis[:-1] for axis in origins.T)
-    changes = x | y | z
+    changes = reduce(or_, (axis[1:] != axis[:-1] for axis in origins.T))
     return np.concatenate([np.zeros(min(len(origins), 1), np.int64), np.flatnonzero(changes) + 1])
 
 
@@ -175,6 +179,7 @@ class RaysFromPlace:
         points: (M, 3) float32, these points relative to the ray origin, metres.
         order: (M,) int32, indices of `points` by increasing azimuth.
         azimuth: (M,) uint16, sorted azimuths from -pi, in steps; a full circle has `_TURN` steps.
+        seconds: time of these rays after that of the scan.
     """
 
     part: slice
@@ -182,17 +187,19 @@ class RaysFromPlace:
     points: Float32Array
     order: Int32Array
     azimuth: Uint16Array
+    seconds: float = 0.0
 
     @classmethod
     def of(cls, points: Float32Array, part: slice, origin: AnyFloatArray) -> RaysFromPlace:
-        """Return the rays from `origin`, (3,) metres, to a part of the (N, 3) points of a scan,
-        given relative to the origin.
+        """Return the rays from `origin`, (3,) metres or (4,) with their time, to a part of the
+        (N, 3) points of a scan, given relative to the origin.
         """
         own = points[part]
         azimuth = _steps(np.arctan2(own[:, 1], own[:, 0])).astype(np.uint16)
         # a radix sort, because they have 16 bits
         order = np.argsort(azimuth, kind="stable").astype(np.int32)
-        return cls(part, translation(origin), own, order, azimuth[order])
+        seconds = float(origin[3:].sum())
+        return cls(part, translation(origin[:3]), own, order, azimuth[order], seconds)
 
     def through(self, box_T_sensor: Transform, lower: FloatArray, upper: FloatArray) -> Int32Array:
         """Return the indices of the points whose rays, from the origin to the point, intersect a

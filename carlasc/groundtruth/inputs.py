@@ -31,6 +31,7 @@ from carlasc.storage import layout
 from carlasc.storage.camera_files import cameras_of, scan_T_camera
 from carlasc.storage.inputs import (
     ACCEPTED,
+    PROVISIONAL,
     FrameFiles,
     MadeFrom,
     SequenceFiles,
@@ -398,6 +399,13 @@ class InputCheck:
     def _name(self) -> str:
         return f"made-{self.grid}"
 
+    @cached_property
+    def is_provisional(self) -> bool:
+        """Whether the grid was made while the input grew, so that all of its frames are made
+        again.
+        """
+        return MadeFrom.read(self.writer, self._name).whole == PROVISIONAL
+
     def look(
         self, existing: Collection[int], agrees: Callable[[int], bool | None], run: Run
     ) -> None:
@@ -411,7 +419,8 @@ class InputCheck:
         """
         inputs, files = self.inputs, self.inputs.files()
         record = self._record = MadeFrom.read(self.writer, self._name)
-        if files is None or (self.compare == "never" and existing):
+        kept = self.compare == "never" and existing and not self.is_provisional
+        if files is None or kept:
             return
         contents = content_digests(files, inputs.depended(), self.writer, self.compare, run)
         inputs.take_contents(contents)
@@ -419,7 +428,8 @@ class InputCheck:
         self._whole = combined(sorted(self._own.items()), inputs.shared())
         self.changed = self.must_record = bool(record.own) and self._whole != record.whole
         self.gone = {int(frame) for frame in record.frames} - set(inputs.available())
-        recorded = {frame: record.frames.get(str(frame)) for frame in existing}
+        again = dict.fromkeys(existing, "") if self.is_provisional else {}
+        recorded = {frame: record.frames.get(str(frame)) for frame in existing} | again
         if not self.changed and all(recorded.values()):
             return
         inputs.prepare(self.writer, run, StepCounter(None))
@@ -431,7 +441,9 @@ class InputCheck:
         }
         if self.stale:
             why = describe_changes(record.own, self._own)
-            if not why:
+            if self.is_provisional:
+                why = "they were provisional"
+            elif not why:
                 was_interrupted = "" in recorded.values()
                 why = "a run was interrupted" if was_interrupted else "what all scans share changed"
             self.notes.append(f"{self.writer.location}: {made_again(self.stale, why)}")
@@ -540,6 +552,13 @@ class InputCheck:
         record.frames |= {str(frame): self._made_from(frame) for frame in sorted(again)}
         record.whole = self._whole
         record.write(self.writer, self._name)
+
+
+def remove_provisional(writer: SequenceWriter, sequence: Sequence) -> None:
+    """Remove the provisional grids of a sequence: those of another geometry than the final ones."""
+    for grid in sequence.grids:
+        if MadeFrom.read(writer, f"made-{grid}").whole == PROVISIONAL:
+            writer.remove_grid(grid)
 
 
 def choose_frames(frames: FrameRange, available: IntArray, where: str) -> list[int]:

@@ -300,21 +300,14 @@ def _prepare(
     """
     path = "/".join(part for part in (inputs.path, plan.spec.coordinates) if part)
     writer = sink.sequence(path)
-    how = {"free_step_m": float(plan.voting.free_step_m), "voting": plan.rule}
-    how |= (
-        {"min_confidence": float(plan.voting.min_confidence)} if plan.voting.min_confidence else {}
-    )
-    made_from = inputs.record()
-    record = {"format": RECORD_FORMAT, "rule": RULES[made_from["observe"]], **made_from, **how}
+    params = settings_of(inputs, plan)
     cameras = inputs.cameras()
     if plan.voting.keep_seen:
         check_views(plan.spec, inputs.frames[0].views(), inputs.location)
-    record |= {"labels": inputs.metadata.predicted} if inputs.metadata.predicted else {}
-    settings = plan.spec.to_params(inputs.metadata.classes.num_channels) | {RECORD: record}
-    params = parse_json(to_json(settings), plan.grid)  # as a later run reads it
     numbers = [frame.number for frame in inputs.frames]
-    exists = check_grid(writer, plan.grid, params, numbers, overwrite=overwrite)
     check = InputCheck(inputs, writer, plan.grid, compare)
+    may_replace = overwrite or check.is_provisional
+    exists = check_grid(writer, plan.grid, params, numbers, overwrite=may_replace)
     documents = {
         layout.METADATA: agree_metadata(writer, inputs.metadata),
         layout.POSES: agree_lines(
@@ -327,8 +320,22 @@ def _prepare(
         layout.params_file(plan.grid): to_json(params),
     }
     needed = {name: data for name, data in documents.items() if data is not None}
-    replaces = exists and overwrite
+    is_other = writer.read_document(layout.params_file(plan.grid)) != to_json(params)
+    replaces = exists and (overwrite or is_other)
     return SequenceJob(path, inputs, plan, writer, needed, params, replaces, check)
+
+
+def settings_of(inputs: SequenceInput, plan: GridPlan) -> dict[str, Any]:
+    """Return the params.json of the grid of a sequence, as a later run reads it."""
+    how = {"free_step_m": float(plan.voting.free_step_m), "voting": plan.rule}
+    how |= (
+        {"min_confidence": float(plan.voting.min_confidence)} if plan.voting.min_confidence else {}
+    )
+    made_from = inputs.record()
+    record = {"format": RECORD_FORMAT, "rule": RULES[made_from["observe"]], **made_from, **how}
+    record |= {"labels": inputs.metadata.predicted} if inputs.metadata.predicted else {}
+    settings = plan.spec.to_params(inputs.metadata.classes.num_channels) | {RECORD: record}
+    return parse_json(to_json(settings), plan.grid)
 
 
 def _begin(job: SequenceJob) -> None:

@@ -288,7 +288,10 @@ def _options_of(record: Mapping[str, Any]) -> FromScans:
         first, _, last = str(given["window"]).partition(":")
         given["window"] = (int(first), int(last))
     given["poses"] = PoseOptions(
-        record.get("poses", "file"), record.get("refine", "never"), force=True
+        record.get("poses", "file"),
+        record.get("refine", "never"),
+        force=True,
+        loops=record.get("loops", "auto"),
     )
     if "motion" in given:
         given["motion"] = MotionOptions(given["motion"])

@@ -16,6 +16,7 @@ from carlasc.running.spreading import Run
 from carlasc.storage.folder import FolderSequence, FolderWriter
 from carlasc.storage.inputs import (
     ACCEPTED,
+    PROVISIONAL,
     FrameFiles,
     MadeFrom,
     SequenceFiles,
@@ -124,6 +125,8 @@ def changed_inputs(sequence: Sequence, grid: str) -> str:
     empty if nothing did, or if it is not known.
     """
     record = _record(sequence, grid)
+    if record.whole == PROVISIONAL:
+        return "provisional grids, made while the drive grew"
     if not record.own or not (now := _own_now(sequence, grid, record)):
         return ""
     # an output may have a part of the scans only, but none that its input has not

@@ -13,6 +13,7 @@ from .ground import ground_height as ground_height
 from .ground import ground_points as ground_points
 from .linking import Chain as Chain
 from .linking import Linker as Linker
+from .options import LoopMode as LoopMode
 from .options import MotionOptions as MotionOptions
 from .options import MotionSource as MotionSource
 from .options import PoseOptions as PoseOptions
@@ -21,6 +22,7 @@ from .options import RefineMode as RefineMode
 from .segments import Segment as Segment
 from .segments import StaticPoints as StaticPoints
 from .segments import is_fast as is_fast
+from .segments import moved_back as moved_back
 from .segments import segment_by_flow as segment_by_flow
 from .segments import segment_by_instances as segment_by_instances
 from .segments import static_actor_points as static_actor_points

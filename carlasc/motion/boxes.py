@@ -20,7 +20,7 @@ from carlasc.core.geometry import Transform, invert, multiply, rotation_z, trans
 from carlasc.core.scans import Scan, finite
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent
 from carlasc.motion.paths import MIN_POINTS, best_observation, corrections
-from carlasc.motion.segments import MIN_SPEED_M_S, Segment
+from carlasc.motion.segments import MIN_SPEED_M_S, Segment, moved_back
 from carlasc.motion.solving import nearest_rotation, resample, smooth
 from carlasc.motion.tracks import Track
 
@@ -140,18 +140,24 @@ def segment_by_boxes(
     candidates = np.flatnonzero(usable)
     x, y = scan.points[candidates, 0], scan.points[candidates, 1]
     labels = None if scan.labels is None else scan.labels[candidates]
+    times = scan.others.get("seconds")
+    late_s = 0.0 if times is None else float(np.abs(times).max(initial=0.0))
     sensor_T_world = invert(world_T_sensor)
     for index in np.argsort([-np.prod(track.size) for track in tracks], kind="stable").tolist():
         track = tracks[index]
-        pose = track.pose(frame)
-        if pose is not None:
+        pose, velocity = track.pose(frame), track.velocity_at(frame)
+        if pose is not None and velocity is not None:
             reach = (
                 np.linalg.norm(np.maximum(np.abs(track.lower), np.abs(track.upper)), axis=0)
+                + float(np.linalg.norm(velocity)) * late_s
                 + _ROUNDING_M
             )
             there = transform_points(sensor_T_world, pose[:3, 3])
             near = np.flatnonzero((np.abs(x - there[0]) <= reach) & (np.abs(y - there[1]) <= reach))
             points = transform_points(world_T_sensor, scan.points[candidates[near]])
+            points = moved_back(
+                points, None if times is None else times[candidates[near]], velocity
+            )
             members = near[_inside(track, pose, points, None if labels is None else labels[near])]
             owners[candidates[members]] = index
     segments = []
@@ -160,6 +166,8 @@ def segment_by_boxes(
         if len(members):
             own = transform_points(world_T_sensor, scan.points[members])
             velocity, origin = track.velocity_at(frame), world_T_sensor[:3, 3]
+            assert velocity is not None
+            own = moved_back(own, None if times is None else times[members], velocity)
             segments.append(
                 Segment(frame, track.label, members, own, velocity, track.instance, origin)
             )

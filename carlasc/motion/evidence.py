@@ -41,6 +41,7 @@ from carlasc.core.geometry import Transform, invert, multiply, thin, transform_p
 from carlasc.core.scans import finite, runs_of_origins
 from carlasc.errors import FormatError
 from carlasc.motion.ground import ground_points
+from carlasc.motion.segments import spread_rows
 
 HORIZON_S = 5.0  # fact: horizon
 """Scans up to this many seconds before and after a scan are looked up."""
@@ -81,6 +82,7 @@ class EvidenceScan:
             none.
         origins: (N, 3) origins of the rays, metres, sensor frame; None: at the sensor. Points with
             one origin follow each other.
+        times: (N,) seconds of the points after the time of the scan; None if they are unknown.
     """
 
     frame: int
@@ -91,6 +93,7 @@ class EvidenceScan:
     labels: LabelArray | None = None
     explained: BoolArray | None = None
     origins: Float32Array | None = None
+    times: AnyFloatArray | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3:
@@ -119,6 +122,7 @@ class FreeSpaceEvidence:
             of static objects.
         world_T_sensor: (4, 4) pose of the scan.
         near: (K,) cells of the points around the sensor that are not ground: see `cells_around`.
+        times: seconds of the `points` after the time of the scan; empty if they are unknown.
     """
 
     frame: int
@@ -131,12 +135,18 @@ class FreeSpaceEvidence:
     around: tuple[int, ...]
     world_T_sensor: Transform
     near: IntArray
+    times: tuple[AnyFloatArray, ...] = ()
 
     def thinned(self, most: int = 400) -> FreeSpaceEvidence:
         """Return the same with at most `most` of the `points` of each cluster; `clusters` stay
         complete.
         """
-        return replace(self, points=tuple(thin(points, most) for points in self.points))
+        if not self.times:
+            return replace(self, points=tuple(thin(points, most) for points in self.points))
+        rows = [spread_rows(len(points), most) for points in self.points]
+        points = tuple(own[kept] for own, kept in zip(self.points, rows, strict=True))
+        times = tuple(own[kept] for own, kept in zip(self.times, rows, strict=True))
+        return replace(self, points=points, times=times)
 
     @property
     def moved(self) -> BoolArray:
@@ -243,8 +253,9 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     around = _count_around(world, groups, static)
     parts = (tuple(clusters), tuple(points), tuple(classes), freed, around)
     near = cells_around(scan.points[candidates])
+    times = () if scan.times is None else tuple(scan.times[members] for members in clusters)
     return FreeSpaceEvidence(
-        scan.frame, own.seconds, len(scan.points), *parts, scan.world_T_sensor, near
+        scan.frame, own.seconds, len(scan.points), *parts, scan.world_T_sensor, near, times
     )
 
 

@@ -193,7 +193,10 @@ class _Link:
         points = evidence.points[index]
         pose, freed, around = evidence.world_T_sensor, evidence.freed[index], evidence.around[index]
         members, label = evidence.clusters[index], evidence.labels[index]
-        segment = Segment(evidence.frame, label, members, points, None, origin=pose[:3, 3])
+        times = evidence.times[index] if evidence.times else None
+        segment = Segment(
+            evidence.frame, label, members, points, None, origin=pose[:3, 3], times=times
+        )
         return cls(
             evidence.seconds, segment, points.min(axis=0), points.max(axis=0), freed, around, pose
         )
@@ -209,10 +212,14 @@ class _Link:
 
     def joined(self, other: _Link) -> _Link:
         """Return the two as one observation."""
+        one, more = self.segment, other.segment
         segment = replace(
-            self.segment,
-            members=np.concatenate([self.segment.members, other.segment.members]),
-            points=np.concatenate([self.segment.points, other.segment.points]),
+            one,
+            members=np.concatenate([one.members, more.members]),
+            points=np.concatenate([one.points, more.points]),
+            times=None
+            if one.times is None or more.times is None
+            else np.concatenate([one.times, more.times]),
         )
         lower, upper = np.minimum(self.lower, other.lower), np.maximum(self.upper, other.upper)
         freed, around = self.freed + other.freed, self.around + other.around
@@ -269,8 +276,13 @@ class _ActorChain:
         label = int(votes.argmax()) or default_label
         sizes = np.quantile([link.upper - link.lower for link in self.links], 0.8, axis=0)
         rigid = label not in deformable if votes.argmax() and deformable else not _is_small(sizes)
-        samples = [thin(s.points, _SAMPLES) for s in segments]
-        positions, velocities, headings = estimate_path(samples, seconds, rigid=rigid)
+        thinned = [segment.thinned(_SAMPLES) for segment in segments]
+        samples = [segment.points for segment in thinned]
+        delays = [s.times for s in thinned] if thinned[0].times is not None else None
+        positions, velocities, headings = estimate_path(
+            samples, seconds, rigid=rigid, delays=delays
+        )
+        samples = [few.at_frame(v).points for few, v in zip(thinned, velocities, strict=True)]
         speeds = np.linalg.norm(velocities[:, :2], axis=1)
         if (
             np.ptp(positions[:, :2], axis=0).max() < _MIN_PATH_M
@@ -290,7 +302,7 @@ class _ActorChain:
         if confidence < _LEAST_CONFIDENCE:
             return None
         parts = [
-            replace(segment, label=label, velocity=velocity, instance=instance)
+            replace(segment.at_frame(velocity), label=label, velocity=velocity, instance=instance)
             for segment, velocity in zip(segments, velocities, strict=True)
         ]
         return FoundActor(tuple(parts), rigid, confidence)

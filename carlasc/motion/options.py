@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from carlasc.core.choices import LoopMode as LoopMode  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import MotionSource as MotionSource  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import PoseSource as PoseSource  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import RefineMode as RefineMode  # noqa: PLC0414 (part of this module)
@@ -25,6 +26,8 @@ class PoseOptions:
             if their calibration is missing.
         odometry_voxel_m: size of the voxels in which estimation thins points, in metres. None: by
             the distances of the points.
+        loops: close loops, when poses are refined. "auto": poses become consistent at places that
+            are met again, if both passes then agree clearly better. "never": they may drift apart.
 
     Raises:
         ArgumentError: an unknown value, or a size that is not positive.
@@ -34,10 +37,12 @@ class PoseOptions:
     refine: RefineMode = "auto"
     force: bool = False
     odometry_voxel_m: float | None = None
+    loops: LoopMode = "auto"
 
     def __post_init__(self) -> None:
         check_choice("poses", self.source, PoseSource)
         check_choice("refine", self.refine, RefineMode)
+        check_choice("loops", self.loops, LoopMode)
         if self.odometry_voxel_m is not None and not self.odometry_voxel_m > 0:
             raise ArgumentError(
                 "odometry_voxel_m",

@@ -17,9 +17,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from carlasc.core.arrays import FloatArray
+from carlasc.core.arrays import AnyFloatArray, FloatArray
 from carlasc.core.geometry import invert, multiply, rotation_z, thin, transform_points
 from carlasc.motion.planes import Planes, nearest_points, pose_of, register
+from carlasc.motion.segments import moved_back
 from carlasc.motion.solving import fast_rows, headings_of, resample, smooth, smooth_at
 
 MIN_POINTS = 10  # observations with fewer points are interpolated from the others
@@ -51,7 +52,11 @@ _GAIN = 0.3  # weight of the last correction in the estimate of the motion
 
 
 def estimate_path(
-    observations: Sequence[FloatArray], seconds: FloatArray, *, rigid: bool
+    observations: Sequence[FloatArray],
+    seconds: FloatArray,
+    *,
+    rigid: bool,
+    delays: Sequence[AnyFloatArray | None] | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Estimate the position, the velocity and the heading of an actor at each of its observations.
 
@@ -63,6 +68,7 @@ def estimate_path(
         observations: (M, 3) points of the actor at each time, metres, world.
         seconds: (F,) times, increasing.
         rigid: whether the actor keeps its shape.
+        delays: (M,) seconds of the points after each of these times; None: all are 0.
 
     Returns:
         (F, 3) centre of the actor, metres, world, its (F, 3) velocity, m/s, world, and its (F,)
@@ -83,7 +89,11 @@ def estimate_path(
             np.zeros(len(seconds)),
         )
     best = best_observation(chosen)
-    path, turns = follow(chosen, at, best) if rigid else (middles_of(chosen), None)
+    after = None if delays is None else [delays[i] for i in enough.tolist()]
+    if after is not None and not rigid:
+        walked = smooth(middles_of(chosen), at, weights, _WALK_S)[1]
+        chosen = [moved_back(*seen) for seen in zip(chosen, after, walked, strict=True)]
+    path, turns = follow(chosen, at, best, after) if rigid else (middles_of(chosen), None)
     positions, velocities = smooth(path, at, weights, _DRIVE_S if rigid else _WALK_S)
     positions, velocities = resample(
         seconds, at, positions, _limit_acceleration(velocities, at, best)
@@ -196,7 +206,10 @@ def headings_by_turns(velocities: FloatArray, turns: FloatArray, seconds: FloatA
 
 
 def follow(
-    observations: Sequence[FloatArray], seconds: FloatArray, best: int
+    observations: Sequence[FloatArray],
+    seconds: FloatArray,
+    best: int,
+    delays: Sequence[AnyFloatArray | None] | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Register the observations of a rigid, upright actor, from the best observation outwards.
 
@@ -204,19 +217,23 @@ def follow(
         observations: (M, 3) points of the actor at each time, metres, world.
         seconds: (F,) times, increasing.
         best: index of the observation to start with: see `best_observation`.
+        delays: (M,) seconds of the points after each of these times; None: all are 0. Points are
+            moved to the time of their observation by the motion so far.
 
     Returns:
         (F, 3) centre of the actor, metres, world, and its (F,) heading, radians, 0 in the best
         observation.
     """
     counts = np.array([len(points) for points in observations])
-    middles = middles_of(observations)
+    middles, seen_at = middles_of(observations), list(observations)
+    delays = [None] * len(counts) if delays is None else delays
     states = np.zeros((len(counts), 4))  # x, y, z, yaw of the actor at each time
-    states[best, :3] = middles[best]
     initial = smooth_at(best, middles, seconds, np.minimum(counts, 200.0), _INITIAL_S)[1]
     motion = np.append(initial, 0.0)  # of x, y, z and yaw per second
+    seen_at[best] = moved_back(observations[best], delays[best], initial)
+    states[best, :3] = middle = middles_of(seen_at[best : best + 1])[0]
     model = Planes()
-    model.add(observations[best] - middles[best])
+    model.add(seen_at[best] - middle)
     seen = 0
     for step, stop in ((1, len(counts)), (-1, -1)):
         velocity, previous = motion, best
@@ -228,8 +245,9 @@ def follow(
                 * max(1.0, abs(elapsed) / 0.1)
                 * (_UNKNOWN / (1 + seen) if seen < _UNKNOWN - 1 else 1.0)
             )
-            points = thin(observations[index], _REGISTERED)
-            shifts = _shift_of_ends(observations[previous], observations[index], velocity[:3])
+            seen_at[index] = moved_back(observations[index], delays[index], velocity[:3])
+            points = thin(seen_at[index], _REGISTERED)
+            shifts = _shift_of_ends(seen_at[previous], seen_at[index], velocity[:3])
             states[index] = register(points, model, predicted, error, states[previous, :3], shifts)
             velocity = velocity + max(_GAIN, 1 / (2 + seen)) * (states[index] - predicted) / elapsed
             if seen < _UNKNOWN and step == 1:

@@ -14,7 +14,8 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from itertools import islice, pairwise
 from typing import Self
 
@@ -22,6 +23,7 @@ import numpy as np
 
 from carlasc.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from carlasc.core.cells import first_of_cells
+from carlasc.core.choices import LoopMode
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import invert, multiply, small_motions, transform_points
 from carlasc.errors import reading
@@ -36,6 +38,7 @@ from carlasc.motion.joint_alignment import (
     spread_of,
     to_plane,
 )
+from carlasc.motion.loops import Submaps, close_loops
 from carlasc.motion.solving import principal_axes
 from carlasc.storage.arrays import ArrayFormat, open_npz
 
@@ -49,6 +52,7 @@ _FORMATS = {
     "after_m": ArrayFormat(("<f8",), (None,)),
     "refined": ArrayFormat(("|b1",), (None,)),
     "fits": ArrayFormat(("|b1",), (None,)),
+    "loops": ArrayFormat(("<f8",), (None, 4)),
 }
 _STRETCH = 2 * HALF_BLOCK  # scans whose poses become final together
 _THIN_M = 0.3  # one point per cell of this size is used
@@ -63,6 +67,9 @@ _SURE, _SURELY_M, _ERRORS, _ALIKE = 0.95, 0.0005, 2.5, 5
 # Greatest change of the motion from one scan to the next, and over some scans: poses of another
 # drive need more.
 _FARTHEST_M, _FARTHEST_RAD = 0.7, np.deg2rad(3.0)
+# A drive may return if poses so far from each other, along it, are near each other; estimated poses
+# are less near with the distance.
+_SPARSE_M, _GONE_M, _AROUND_M, _ASTRAY = 5.0, 60.0, 40.0, 0.02
 _SPAN, _OFF_M, _OFF_RAD = 10, 1.0, np.deg2rad(5.0)
 # Poses fit if enough walls of single scans are flat together with the points of other scans there.
 _WALL_M, _WALL_POINTS = 2.0, 12  # size of the cells, and the fewest points of a wall
@@ -109,6 +116,8 @@ class RefinedPoses:
         refined: (F,) bool, the scans with a changed motion.
         fits: (F,) bool, False where walls of one scan are not flat together with the other scans:
             such poses belong to another drive or to other frames, and are not refined.
+        loops: (L, 4) the loops that were closed: the rows of two scans of one place, and the
+            distance of the surfaces of the two passes before and after, metres.
     """
 
     given: FloatArray
@@ -117,6 +126,7 @@ class RefinedPoses:
     after_m: FloatArray
     refined: BoolArray
     fits: BoolArray
+    loops: FloatArray = field(default_factory=partial(np.empty, (0, 4)))
 
     def changes(self) -> FloatArray:
         """Return the (F - 1, 6) changes of the motions from each scan to the next one: metres, then
@@ -163,7 +173,7 @@ class RefinedPoses:
             key = file.read("key", ArrayFormat(("u1",), (None,))).tobytes()
             arrays = {name: file.read(name, expected) for name, expected in _FORMATS.items()}
         with reading(where, "poses refined by carlasc", "remove it"):
-            if len({len(array) for array in arrays.values()}) != 1:
+            if len({len(array) for name, array in arrays.items() if name != "loops"}) != 1:
                 raise ValueError("arrays of different lengths")
             return cls(**arrays), key.decode()
 
@@ -173,6 +183,7 @@ def refine_poses(
     given: FloatArray,
     *,
     always: bool = False,
+    loops: LoopMode = "auto",
     steps: Callable[[int], None] | None = None,
 ) -> RefinedPoses:
     """Refine the poses of a drive.
@@ -184,6 +195,7 @@ def refine_poses(
         scans: the scans, in order of time; read one after the other.
         given: (F, 4, 4) float64 world_T_sensor of the scans.
         always: whether stretches are also refined where scans do not agree better afterwards.
+        loops: whether loops are closed: see `carlasc.motion.loops`.
         steps: called with the number of scans that were read since the last call.
     """
     count, poses = len(given), given.copy()
@@ -194,7 +206,7 @@ def refine_poses(
     )
     fits = np.ones(count, np.bool_)
     scans, kept, first = iter(scans), list[ThinnedScan](), 0
-    begin = 0
+    begin, submaps = 0, Submaps() if loops == "auto" and _may_return(given) else None
     while begin < count and count >= MIN_SCANS:
         end = count if count - begin < _STRETCH + HALF_BLOCK else begin + _STRETCH
         start, last = max(0, begin - HALF_BLOCK), min(end + HALF_BLOCK, count)
@@ -219,8 +231,33 @@ def refine_poses(
         if chosen:
             poses[begin:end], refined[begin:end] = aligned[rows], True
         after[begin:end] = now if chosen else before[begin:end]
+        if submaps is not None:
+            for row, scan, pose in zip(
+                range(begin, end), kept[rows], poses[begin:end], strict=True
+            ):
+                submaps.add(row, scan.used, scan.measured, pose)
         begin = end
+    if submaps is not None and fits.all():
+        submaps.finish()
+        closed, found = close_loops(submaps.done, poses)
+        if len(found) and (always or _is_better(found[:, 2], found[:, 3])):
+            refined[:] = True
+            return RefinedPoses(given, closed, before, after, refined, fits, found)
     return RefinedPoses(given, poses, before, after, refined, fits)
+
+
+def _may_return(given: FloatArray) -> bool:
+    """Return whether a drive may come near a place again that it has left."""
+    steps = np.sqrt(np.square(np.diff(given[:, :3, 3], axis=0)).sum(axis=1))
+    along = np.append(0.0, np.cumsum(steps))[: len(given)]
+    rows = np.flatnonzero(np.diff(along // _SPARSE_M, prepend=-1.0))
+    along, places = along[rows], given[rows, :2, 3]
+    for i in range(len(rows)):
+        gap, off = along[i] - along[:i], places[i] - places[:i]
+        near = np.hypot(off[:, 0], off[:, 1]) < _AROUND_M + _ASTRAY * gap
+        if (near & (gap > _GONE_M)).any():
+            return True
+    return False
 
 
 def _is_better(before: FloatArray, after: FloatArray) -> bool:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray, IntArray
-from carlasc.core.geometry import Transform, rotate_vectors, transform_points
+from carlasc.core.geometry import Floating, Transform, rotate_vectors, thin, transform_points
 from carlasc.core.scans import Scan
 
 MIN_SPEED_M_S = 0.3  # slower points count as static: estimated flow is never exactly zero
@@ -22,6 +23,7 @@ _BESIDE_M = 1.0
 _SAME_VELOCITY_M_S = 0.5  # greatest difference of flow within one rigid actor
 
 _REST_M = 0.5  # margin around an actor in which its static points are searched for
+_GOLDEN = 0.6180339887  # multiples of it, without their integers, are spread evenly
 LINKED_M_S = 2.0  # maximum change of an actor's velocity between two segments
 
 
@@ -37,6 +39,8 @@ class Segment:
         velocity: (3,) m/s, world; None if the scan has no flow.
         instance: number of the actor; 0 if actors are not numbered.
         origin: (3,) position of the sensor, metres, world.
+        times: (M,) seconds of `points` after the time of the frame; None if they are unknown, or
+            the points are where they are at that time.
     """
 
     frame: int
@@ -46,12 +50,46 @@ class Segment:
     velocity: FloatArray | None
     instance: int = 0
     origin: FloatArray = field(default_factory=lambda: np.zeros(3))
+    times: AnyFloatArray | None = None
 
     @property
     def center(self) -> FloatArray:
         """(3,) centre of the points' bounding box, metres, world."""
         center: FloatArray = (self.points.min(axis=0) + self.points.max(axis=0)) / 2
         return center
+
+    def thinned(self, most: int) -> Segment:
+        """Return the same with at most `most` of the points; `members` stay complete."""
+        if self.times is None:
+            return replace(self, points=thin(self.points, most))
+        rows = spread_rows(len(self.points), most)
+        return replace(self, points=self.points[rows], times=self.times[rows])
+
+    def at_frame(self, velocity: FloatArray) -> Segment:
+        """Return the same with its points moved to the time of the frame, by (3,) m/s, world."""
+        points = moved_back(self.points, self.times, velocity)
+        return self if self.times is None else replace(self, points=points, times=None)
+
+
+def spread_rows(count: int, most: int) -> IntArray:
+    """Return at most `most` of the rows 0 to `count` - 1, spread evenly, but not at one distance:
+    points of a LiDAR that turns are in order of columns, and every N-th may be of few channels.
+    """
+    steps, apart = np.arange(min(count, most)), max(1.0, count / most)
+    return np.asarray(steps * apart + (apart - 1) * (steps * _GOLDEN % 1.0), np.int64)
+
+
+def moved_back(
+    points: NDArray[Floating], times: AnyFloatArray | None, velocity: AnyFloatArray
+) -> NDArray[Floating]:
+    """Return where points are at the time of their frame, which were seen some seconds after it.
+
+    Args:
+        points: (N, 3) metres.
+        times: (N,) seconds; None: the points stay.
+        velocity: (3,) or (N, 3) m/s, on the axes of the points.
+    """
+    return points if times is None else (points - times[:, None] * velocity).astype(points.dtype)
 
 
 def is_fast(flow: AnyFloatArray, min_speed_m_s: float = MIN_SPEED_M_S) -> BoolArray:
@@ -125,7 +163,7 @@ def segment_by_instances(
     )
     points = transform_points(world_T_sensor, scan.points[numbered])
     flow = None if scan.flow is None else rotate_vectors(world_T_sensor, scan.flow[numbered])
-    segments = []
+    segments, times = [], scan.others.get("seconds")
     numbers = scan.instances[numbered].astype(np.int64)
     spread = (
         points / _REACH_M
@@ -136,9 +174,10 @@ def segment_by_instances(
         members = numbered[own]
         label = int(np.bincount(scan.labels[members]).argmax())
         velocity = None if flow is None else np.median(flow[own], axis=0)
-        number = int(scan.instances[members[0]])
+        number, origin = int(scan.instances[members[0]]), world_T_sensor[:3, 3]
+        seen_at = None if times is None or flow is not None else times[members]
         segments.append(
-            Segment(frame, label, members, points[own], velocity, number, world_T_sensor[:3, 3])
+            Segment(frame, label, members, points[own], velocity, number, origin, seen_at)
         )
     return segments
 

@@ -28,6 +28,7 @@ from carlasc.core.geometry import (
     rotate_vectors,
     rotation_z,
     transform_points,
+    translation,
 )
 from carlasc.errors import reading
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent, Sizes, measure, surface_of
@@ -90,10 +91,15 @@ class Track:
     surface: Float32Array = field(default_factory=lambda: np.empty((0, 3), np.float32))
     confidence: float = 1.0
 
-    def pose(self, frame: int) -> Transform | None:
-        """Return (4, 4) world_T_actor at a frame; None if the track does not extend to it."""
+    def pose(self, frame: int, after_s: float = 0.0) -> Transform | None:
+        """Return (4, 4) world_T_actor some seconds after a frame, less than a frame; None if the
+        track does not extend to it.
+        """
         row = frame - self.first
-        return self.world_T_actor[row] if 0 <= row < len(self.world_T_actor) else None
+        if not 0 <= row < len(self.world_T_actor):
+            return None
+        pose = self.world_T_actor[row]
+        return translation(self.velocity[row] * after_s) @ pose if after_s else pose
 
     def velocity_at(self, frame: int) -> FloatArray | None:
         """Return (3,) m/s, world, at a frame; None if the track does not extend to it."""
@@ -152,7 +158,12 @@ def make_track(
     keeps_shape = label not in deformable if rigid is None else rigid
     if any(segment.velocity is None for segment in chain):
         observations = [segment.points for segment in chain]
-        positions, velocities, headings = estimate_path(observations, seconds, rigid=keeps_shape)
+        delays = [s.times for s in chain] if any(s.times is not None for s in chain) else None
+        positions, velocities, headings = estimate_path(
+            observations, seconds, rigid=keeps_shape, delays=delays
+        )
+        chain = [segment.at_frame(v) for segment, v in zip(chain, velocities, strict=True)]
+        observations = [segment.points for segment in chain]
         if is_static(observations, positions, headings, seconds):
             positions, velocities, headings = (
                 np.zeros_like(values) for values in (positions, velocities, headings)

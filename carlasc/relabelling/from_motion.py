@@ -19,6 +19,7 @@ from carlasc.groundtruth.from_scans.sequences import ScanSequence
 from carlasc.groundtruth.inputs import GridPlan
 from carlasc.groundtruth.options import FromScans, Voting
 from carlasc.motion.ground import ground_points
+from carlasc.motion.segments import moved_back
 from carlasc.motion.tracks import MovingActors, Track
 from carlasc.relabelling.copies import timed, write_in_stages
 from carlasc.running.spreading import Run, StepCounter
@@ -181,7 +182,7 @@ def points_of_actors(
     Returns:
         (N,) uint32 numbers, 0 for none, and (N, 3) float32 m/s, sensor frame, ego motion removed.
     """
-    fields = {"labels", "instances"} & feed.sequence.fields()
+    fields = {"labels", "instances", "seconds"} & feed.sequence.fields()
     scan, pose = feed.sequence.scan(frame, tuple(sorted(fields))), feed.pose(frame)
     moving = [track.instance for track in actors.tracks.values()]
     numbers = np.zeros(len(scan), np.uint32)
@@ -209,10 +210,12 @@ def points_of_actors(
     place[order] = np.cumsum(is_new)
     of_scan, of_merged = np.split(place, [len(scan)])
     tracks = [(n, t) for n, t in actors.tracks.items() if t.pose(frame) is not None]
+    times = scan.others.get("seconds")
     for number, track in sorted(tracks, key=lambda item: -float(np.prod(item[1].size))):
-        own = _inside(track, frame, world) & ~ground
+        settled = moved_back(world, times, track.velocity[frame - track.first])
+        own = _inside(track, frame, settled) & ~ground
         own |= np.isin(of_scan, of_merged[track.members.get(frame, [])])
-        velocity = rotate_vectors(invert(pose), velocity_at(track, frame, world[own], feed))
+        velocity = rotate_vectors(invert(pose), velocity_at(track, frame, settled[own], feed))
         is_fast = np.square(velocity).sum(axis=1) > feed.options.motion.min_speed_m_s**2
         numbers[own], flow[own] = actors.numbers[number], np.where(is_fast[:, None], velocity, 0)
     return numbers, flow.astype(np.float32)

@@ -244,9 +244,11 @@ def _poses(posed: Sequence, change: RefinedPoses) -> FloatArray:
 
 
 def _notes(change: RefinedPoses, frames: IntArray) -> list[str]:
-    """Return the first note on the result of a refinement, or one on poses that did not change."""
+    """Return the first note on the result of a refinement, and that on loops, or one on poses that
+    did not change.
+    """
     if notes := list(pose_notes(change, frames)):
-        return notes[:1]
+        return notes[: 2 if len(change.loops) else 1]
     before, _ = change.disagreements_m
     what = "the distance between neighbouring scans is unknown"
     if before is not None:

@@ -162,6 +162,9 @@ class _RetriedTask(Future[Any]):
     def exception(self, timeout: float | None = None) -> BaseException | None:
         return self._attempt.exception(timeout)
 
+    def done(self) -> bool:
+        return self._attempt.done()
+
     def cancel(self) -> bool:
         self._owner.forget(self)
         return self._attempt.cancel()

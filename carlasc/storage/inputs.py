@@ -34,6 +34,8 @@ from carlasc.storage.transport.trees import Tree
 
 ACCEPTED = "accepted"
 """In the place of the digest of a frame: it counts as made of the inputs in the record."""
+PROVISIONAL = "provisional"
+"""In the place of the digest of all inputs: the output was made while its input grew."""
 _FORMAT = 1
 _BYTES = 16  # of the digest of a file
 _SHORT = 8  # bytes of the digests in records
@@ -234,7 +236,7 @@ class MadeFrom:
     """The record of what the frames of an output were made from.
 
     Attributes:
-        whole: digest of all inputs of the sequence.
+        whole: digest of all inputs of the sequence; or `PROVISIONAL`.
         own: digest of the own files, the pose and the time of each frame of the input.
         frames: digest of everything that a frame of the output was made from; empty while a frame
             that exists is made again.

@@ -172,7 +172,7 @@ class Scans(Converter):
         return [
             path
             for path in entries
-            if path.suffix.lower() in FORMATS and path.resolve() not in others
+            if path.suffix.lower() in FORMATS and not (others and path.resolve() in others)
         ]
 
     def _files(self, folder: Path) -> list[Path]:

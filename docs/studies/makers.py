@@ -44,7 +44,7 @@ SEEDS = {"town": range(61, 71)}
 APART = range(51, 55)  # on which the formula and the settings were chosen
 FRAMES, FIRST, EVERY, SENSORS = 41, 30, 5, 40
 LIDAR = Lidar(channels=32, points=30_000)
-MEASURES = ("S", "depth_m", "truth", "all", "seconds")
+MEASURES = ("S", "depth_m", "truth", "all", "known", "seconds")
 
 
 def held_out(drive: Drive, grids: dict[int, Grid]) -> float:
@@ -118,6 +118,12 @@ def truth_of(grids: Mapping[int, Grid], references: Mapping[int, Grid]) -> float
     for frame, grid in grids.items():
         total += score_truth(grid, references[frame], CARLA.num_channels).matrix
     return (total.completeness().iou + float(total.iou[CARLA.id_of("Vehicle")])) / 2
+
+
+def known_share(grids: Mapping[int, Grid], references: Mapping[int, Grid]) -> float:
+    """Return the share of the voxels of the references that a maker does not call unknown."""
+    both = sum(int((grid.known & references[f].known).sum()) for f, grid in grids.items())
+    return both / sum(int(references[f].known.sum()) for f in grids)
 
 
 def everywhere(grid: Grid) -> Grid:
@@ -210,7 +216,8 @@ def measure(
         seconds = (time.process_time() - start) / len(grids)
         scores = (held_out(drive, grids), depth_error(drive, grids), truth_of(grids, references))
         whole = truth_of({f: everywhere(grid) for f, grid in grids.items()}, references)
-        known[name] = dict(zip(MEASURES, (*scores, whole, seconds), strict=True))
+        share = known_share(grids, references)
+        known[name] = dict(zip(MEASURES, (*scores, whole, share, seconds), strict=True))
         kept.write_text(json.dumps(known, indent=1))
     return dict(known[name])
 
@@ -239,17 +246,19 @@ def show(found: dict[str, list[dict[str, float]]], usable: Mapping[str, Rival]) 
     """Print the measures of each maker over drives, the best in truth first, and how well the
     orders of S and of the depth agree with that of truth.
     """
-    print("\n| maker | told | truth | all | S | depth error, m | CPU time per frame |")
-    print("|---|---|---:|---:|---:|---:|---:|")
+    print("\n| maker (told) | truth | known | all | S | depth error, m | CPU time |")
+    print("|---|---:|---:|---:|---:|---:|---:|")
     means = {name: np.mean([d["truth"] for d in drives]) for name, drives in found.items()}
     for name in sorted(found, key=lambda one: -means[one]):
         truth, whole, score, depth = (
             study.interval([drive[key] for drive in found[name]], ".3f")
             for key in ("truth", "all", "S", "depth_m")
         )
+        known = np.mean([drive["known"] for drive in found[name]])
         seconds = np.mean([drive["seconds"] for drive in found[name]])
         told = usable[name.split(";")[0]].told
-        print(f"| {name} | {told} | {truth} | {whole} | {score} | {depth} | {seconds:.2f} s |")
+        cells = (f"{name} ({told})", truth, f"{known:.2f}", whole, score, depth)
+        print(f"| {' | '.join(cells)} | {seconds:.2f} s |")
     for key, sign in (("S", 1), ("depth_m", -1)):
         taus = [
             kendall([sign * one[key] for one in drives], [one["truth"] for one in drives])

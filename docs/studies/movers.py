@@ -26,8 +26,8 @@ from typing import Any
 import movers_drives
 import numpy as np
 import study
-from movers_drives import GRIDS, Recorded, Reference, Setting, record, reference
-from movers_rows import ABLATIONS, BASIC, PARKED, ROWS, UNLABELLED, Row
+from movers_drives import GRIDS, Recorded, Reference, Setting, record_all, reference
+from movers_rows import ABLATIONS, BASIC, PARKED, ROWS, TURNING, UNLABELLED, Row
 from movers_scores import Counts, count, figures
 from movers_tables import Table, write_tables
 
@@ -45,10 +45,12 @@ from carlasc.storage.files import write_atomic
 
 SEEDS = {kind: movers_drives.SEEDS[kind] for kind in ("town", "street")}
 WINDOW = (-30, 30)  # scans that show the sides of actors
-PARTS = ("rules", "lidars", "errors", "held out")  # of the page
+PARTS = ("rules", "lidars", "errors", "held out", "turning")  # of the page
 UNCHANGED = ("align, flow", "align, instances", "align, free space")  # beside the ablations
 HELD_OUT = ("tube", "current", "align, flow", "align, exact boxes", "align, free space")
-BY_NAME = {row.name: row for row in (*ROWS, *ABLATIONS)}
+BY_NAME = {row.name: row for row in (*ROWS, *ABLATIONS, *TURNING)}
+# number of LiDARs that turn, 0: one sees all at one instant; and parts of a turn, 1: the same
+TURNS = ((0, 20), (1, 20), (3, 1), (3, 20))
 
 
 @dataclass(frozen=True)
@@ -78,8 +80,8 @@ class Task:
 def tasks_of(given: argparse.Namespace) -> list[Task]:
     """Return what is to be done."""
     work: Path = given.work
-    every, basic, ablations, parked = (
-        tuple(row.name for row in rows) for rows in (ROWS, BASIC, ABLATIONS, PARKED)
+    every, basic, ablations, parked, turning = (
+        tuple(row.name for row in rows) for rows in (ROWS, BASIC, ABLATIONS, PARKED, TURNING)
     )
     if given.parked:
         return [Task(Setting("parked", seed, 64), tuple(GRIDS), parked, work) for seed in (1, 2, 3)]
@@ -100,6 +102,11 @@ def tasks_of(given: argparse.Namespace) -> list[Task]:
             *each(32, "0.2 m", basic),
         ],
         "errors": each(32, "coarse", (*UNCHANGED, *ablations)),
+        "turning": [
+            Task(Setting(*drive, 32, *turns), ("coarse",), turning, work)
+            for turns in TURNS
+            for drive in drives
+        ],
         "held out": [replace(task, held_out=True) for task in each(32, "coarse", HELD_OUT)],
     }
     return [task for part in given.part or PARTS for task in parts[part]]
@@ -141,7 +148,7 @@ def run(task: Task) -> None:
     if not missing:
         return
     setting = task.setting
-    (drive,) = record(setting.kind, setting.seed, [setting.channels], task.work)
+    (drive,) = record_all([setting], task.work)
     actors = ActorStore(task.work / "scores" / str(setting) / "actors")
     for row, grid in missing:
         start = time.perf_counter()
@@ -232,11 +239,14 @@ def make(
 
 def tables(tasks: Iterable[Task]) -> list[Table]:
     """Return the tables of what was made so far."""
-    found: dict[tuple[str, int, tuple[str, ...]], Table] = {}
+    found: dict[tuple[object, ...], Table] = {}
     for task in (task for task in tasks if not task.held_out):
         for grid in task.grids:
+            lidar = task.setting.channels, task.setting.lidars, task.setting.parts
             title = f"{task.setting.channels} channels, {grid}"
-            table = found.setdefault((grid, task.setting.channels, task.rows), Table(title, {}))
+            if task.setting.lidars:
+                title += f", {task.setting.lidars} x {task.setting.parts} parts of a turn"
+            table = found.setdefault((grid, lidar, task.rows), Table(title, {}))
             for row in task.rows:
                 path = task.path(row, grid)
                 if path.exists():

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from carlasc_recorders import TownActor, TownDrive
 from carlasc_recorders.town.actors import EGO_ID
-from carlasc_recorders.town.drive import REFERENCE_OFFSET_M, scan_snapshot
+from carlasc_recorders.town.drive import REFERENCE_OFFSET_M, concatenate_scans, scan_snapshot
 from numpy.typing import NDArray
 from railed import RailedDrive
 from street import StreetDrive
@@ -22,7 +22,7 @@ from study import is_tiny, labels_of
 
 import carlasc
 from carlasc import Boxes, GridSpec
-from carlasc.captures import Lidar
+from carlasc.captures import Lidar, SensorRecording
 from carlasc.core.geometry import Transform, invert, relative_to, transform_points, translation
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth import Observation, count_votes
@@ -96,18 +96,24 @@ def kind_of(name: str) -> Kind:
     return replace(kind, frames=12, candidates=(4,), judged=1, sensors=2) if is_tiny() else kind
 
 
-def lidar_of(channels: int) -> Lidar:
-    """Return a LiDAR; that of a tiny study has few rays."""
-    return Lidar(channels=channels, points=POINTS[channels] // (12 if is_tiny() else 1))
-
-
 @dataclass(frozen=True)
 class Setting:
-    """A drive and the LiDAR that records it."""
+    """A drive and the LiDAR that records it.
+
+    Attributes:
+        kind: kind of the drive.
+        seed: its seed.
+        channels: number of channels of each LiDAR.
+        lidars: number of LiDARs that turn at one place, each from another azimuth; 0: one LiDAR
+            that sees everything at one instant.
+        parts: of a turn; 1: they do not turn.
+    """
 
     kind: str
     seed: int
     channels: int
+    lidars: int = 0
+    parts: int = 20
 
     @property
     def drive(self) -> str:
@@ -115,7 +121,28 @@ class Setting:
         return f"{self.kind}{self.seed}"
 
     def __str__(self) -> str:
-        return f"{self.drive}_{self.channels}"
+        turning = f"_{self.lidars}x{self.parts}" if self.lidars else ""
+        return f"{self.drive}_{self.channels}{turning}"
+
+    @property
+    def lidar(self) -> Lidar:
+        """Each LiDAR; that of a tiny study has few rays."""
+        points = POINTS[self.channels] // max(self.lidars, 1) // (12 if is_tiny() else 1)
+        return Lidar(channels=self.channels, points=points)
+
+    def record(self, drive: TownDrive, frame: int) -> SensorRecording:
+        """Return what the LiDARs see."""
+        if not self.lidars:
+            noise = np.random.default_rng([self.seed, self.channels, frame])
+            pose = drive.sensor_poses(frame, 1)[0]
+            return scan_snapshot(drive.snapshot(frame), pose, self.lidar, noise)
+        drive.lidar = self.lidar
+        turns = [
+            drive.sweep(frame, parts=self.parts, phase=k / self.lidars) for k in range(self.lidars)
+        ]
+        hit = np.unique(np.concatenate([turn.velocities for turn in turns]), axis=0)
+        scan = concatenate_scans([turn.scan for turn in turns])
+        return SensorRecording(scan, turns[0].world_T_sensor, hit)
 
 
 @dataclass(frozen=True)
@@ -169,20 +196,24 @@ def record(kind: str, seed: int, channels: Iterable[int], work: Path) -> list[Re
     """Record a drive with everything that tells what moves, once for each LiDAR; those that were
     recorded before are opened.
     """
-    settings = {count: Setting(kind, seed, count) for count in channels}
-    folders = {count: work / "drives" / str(setting) for count, setting in settings.items()}
-    missing = {count: folder for count, folder in folders.items() if not folder.exists()}
+    return record_all([Setting(kind, seed, count) for count in channels], work)
+
+
+def record_all(settings: Iterable[Setting], work: Path) -> list[Recorded]:
+    """Record one drive in several settings; those that were recorded before are opened."""
+    folders = {setting: work / "drives" / str(setting) for setting in settings}
+    missing = {setting: folder for setting, folder in folders.items() if not folder.exists()}
     if missing:
         unfinished = {
-            count: folder.with_name(f"{folder.name}.{os.getpid()}")
-            for count, folder in missing.items()
+            setting: folder.with_name(f"{folder.name}.{os.getpid()}")
+            for setting, folder in missing.items()
         }
         for folder in unfinished.values():
             shutil.rmtree(folder, ignore_errors=True)
-        _write(kind, seed, unfinished)
-        for count, folder in unfinished.items():
-            folder.rename(missing[count])
-    return [Recorded(settings[count], _open(folder), folder) for count, folder in folders.items()]
+        _write(unfinished)
+        for setting, folder in unfinished.items():
+            folder.rename(missing[setting])
+    return [Recorded(setting, _open(folder), folder) for setting, folder in folders.items()]
 
 
 def _open(folder: Path) -> Sequence:
@@ -190,16 +221,16 @@ def _open(folder: Path) -> Sequence:
     return sequence
 
 
-def _write(kind: str, seed: int, folders: dict[int, Path]) -> None:
-    """Record a drive by LiDARs of several numbers of channels, each in its folder."""
-    frames = kind_of(kind).frames
-    lidars = {channels: lidar_of(channels) for channels in folders}
-    drive = kind_of(kind).make(seed, Lidar())
+def _write(folders: dict[Setting, Path]) -> None:
+    """Record a drive in several settings, each in its folder."""
+    first = next(iter(folders))
+    frames = kind_of(first.kind).frames
+    drive = kind_of(first.kind).make(first.seed, Lidar())
     poses = np.stack([drive.sensor_poses(frame, 1)[0] for frame in range(frames)])
     writers = {
-        channels: FolderSink(folder).sequence("cartesian") for channels, folder in folders.items()
+        setting: FolderSink(folder).sequence("cartesian") for setting, folder in folders.items()
     }
-    sightings: dict[int, list[NDArray[np.float64]]] = {channels: [] for channels in folders}
+    sightings: dict[Setting, list[NDArray[np.float64]]] = {setting: [] for setting in folders}
     for writer in writers.values():
         writer.write_document(layout.POSES, layout.encode_poses(relative_to(poses[0], poses)))
         writer.write_document(
@@ -208,9 +239,8 @@ def _write(kind: str, seed: int, folders: dict[int, Path]) -> None:
         )
     for frame in range(frames):
         snapshot = drive.snapshot(frame)
-        for channels, writer in writers.items():
-            noise = np.random.default_rng([seed, channels, frame])
-            recording = scan_snapshot(snapshot, poses[frame], lidars[channels], noise)
+        for setting, writer in writers.items():
+            recording = setting.record(drive, frame)
             scan = recording.scan
             assert scan.instances is not None
             writer.write(
@@ -219,16 +249,18 @@ def _write(kind: str, seed: int, folders: dict[int, Path]) -> None:
             writer.write("labels", frame, labels_of(scan))
             writer.write("instances", frame, scan.instances)
             writer.write("flow", frame, recording.flow())
+            for name, values in scan.others.items():
+                writer.write(name, frame, values)
             numbers, points = np.unique(scan.instances[scan.instances > 0], return_counts=True)
             boxes = boxes_of([snapshot.actors[int(number)] for number in numbers], poses[frame])
             writer.write("boxes", frame, boxes.to_table())
             sensors = np.array([invert(pose)[:3, 3] for pose in boxes.sensor_T_box]).reshape(-1, 3)
             at = np.full(len(numbers), frame)
-            sightings[channels].append(
+            sightings[setting].append(
                 np.column_stack([at, numbers, points, sensors, boxes.sizes / 2])
             )
-    for channels, folder in folders.items():
-        np.save(folder / SIGHTINGS, np.concatenate(sightings[channels]))
+    for setting, folder in folders.items():
+        np.save(folder / SIGHTINGS, np.concatenate(sightings[setting]))
 
 
 def boxes_of(actors: list[TownActor], world_T_sensor: Transform) -> Boxes:

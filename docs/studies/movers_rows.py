@@ -105,6 +105,11 @@ def without_labels(drive: Recorded, frame: int) -> Sequence:
     return Only(drive.sequence, BARE)
 
 
+def without_times(drive: Recorded, frame: int) -> Sequence:
+    """Leave out the times of points."""
+    return Only(drive.sequence, drive.sequence.fields() - {"seconds"})
+
+
 def unchanged(drive: Recorded, frame: int) -> Sequence:
     """Return the drive as it was recorded."""
     return drive.sequence
@@ -305,6 +310,11 @@ ABLATIONS = (
 
 The window is 30 frames elsewhere.
 """
+TURNING = (
+    *(Row(f"align, {hint}", observe) for hint, observe in _HINTS.items()),
+    *(Row(f"{hint}, without times", observe, without_times) for hint, observe in _HINTS.items()),
+)
+"""The rows with LiDARs that turn: with the times of points, and without them."""
 BASIC = tuple(
     row
     for row in ROWS

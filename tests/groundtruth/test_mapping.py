@@ -2,6 +2,7 @@
 files, and what is refused.
 """
 
+import csv
 import json
 
 import numpy as np
@@ -13,7 +14,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import carlasc
 from carlasc import GridSpec, MapExtras, Run
-from carlasc.core.geometry import mirror_poses, quaternions_of, relative_to, transform_points
+from carlasc.core.geometry import (
+    mirror_poses,
+    quaternions_of,
+    relative_to,
+    rotation_z,
+    transform_points,
+)
 from carlasc.core.grids import mirror_voxels
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
@@ -47,9 +54,7 @@ def drive(tmp_path_factory):
 
 def make(drive, out, **options):
     given = {"motion": NONE, "poses": GIVEN, "run": ALONE, "cell_m": 0.1} | options
-    extras = MapExtras(
-        **{k: given.pop(k) for k in ("actors", "mesh", "distance", "trajectory") if k in given}
-    )
+    extras = MapExtras(**{k: given.pop(k) for k in vars(MapExtras()) if k in given})
     return carlasc.map(drive, out, extras=extras, **given)
 
 
@@ -119,6 +124,34 @@ def test_the_trajectory_is_that_of_the_drive_in_the_format_of_tum(drive, tmp_pat
         assert_allclose(row[[7, 4, 5, 6]], quaternions_of(pose[None, :3, :3])[0], atol=1e-5)
     with raises(ArgumentError, where="trajectory"):
         make(drive, tmp_path / "g.ply", grid=GRID, trajectory=tmp_path / "other.tum")
+
+
+def test_boxes_of_moving_actors_are_a_table_in_the_frame_of_the_map(drive, tmp_path):
+    options = {"motion": FLOW, "frames": "2:5"}
+    make(drive, tmp_path / "a.npz", boxes_out=tmp_path / "boxes.csv", **options)
+    make(drive, tmp_path / "b.npz", boxes_out=tmp_path / "boxes.json", **options)
+    with (tmp_path / "boxes.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    same = [
+        {name: str(value) for name, value in row.items()}
+        for row in json.loads((tmp_path / "boxes.json").read_text())
+    ]
+    assert rows == same
+    numbers = [row["number"] for row in rows]
+    rows = [row for row in rows if numbers.count(row["number"]) == 3]  # the car
+    assert [row["time"] for row in rows] == ["0.2", "0.3", "0.4"]
+    for row, frame in zip(rows, range(2, 5), strict=True):
+        points, _, moving = world_points(frame)
+        half = np.array([float(row[name]) for name in ("length", "width", "height")]) / 2
+        middle = np.array([float(row[name]) for name in "xyz"])
+        turned = rotation_z(-float(row["heading"]))[:3, :3]
+        inside = (np.abs((points[moving] - middle) @ turned.T) < half + 0.1).all(axis=1)
+        assert inside.mean() > 0.95
+        ahead = np.array([np.cos(float(row["heading"])), np.sin(float(row["heading"]))])
+        velocity = np.array([float(row["vx"]), float(row["vy"])])
+        assert velocity @ ahead > 0.9 * np.linalg.norm(velocity) > 1
+    with raises(ArgumentError, where="boxes_out"):
+        make(drive, tmp_path / "g.ply", grid=GRID, boxes_out=tmp_path / "g.csv")
 
 
 def test_what_moves_leaves_no_trace_and_what_stands_stays(drive, tmp_path):

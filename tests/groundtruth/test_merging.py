@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.errors import raises
 
 from carlasc.core.geometry import invert, rotation_z, transform_points, translation
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, SEMANTICKITTI
+from carlasc.errors import FormatError
 from carlasc.groundtruth import FromScans
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import (
@@ -400,3 +402,43 @@ def test_all_points_of_an_actor_vote_for_its_class():
         PEDESTRIAN,
         1,
     ]
+
+
+def scan_in_turn(frame, late_s=0.08):
+    """The scan of a LiDAR that reaches the actor some time after the frame."""
+    instant = scan(frame)
+    seconds = np.array([0.0, late_s, late_s], np.float32)
+    points = instant.points.copy()
+    points[1] += np.float32(late_s) * np.float32([0.0, 2.0, 0.0])
+    places = np.column_stack([np.zeros((3, 3), np.float32), seconds])
+    return PreparedScan.of(
+        frame, points, instant.labels, instant.world_T_sensor, seconds=0.1 * frame, origins=places
+    )
+
+
+def test_points_of_an_actor_are_moved_by_its_motion_between_their_times_and_the_frame():
+    scans, instants = ({frame: of(frame) for frame in FRAMES} for of in (scan_in_turn, scan))
+    merger = Merger(scans.__getitem__, MovingActors({0: track()}), CARLA, "align")
+    for frame in FRAMES:
+        assert merger.static(frame).tolist() == [True, False, True]
+        settled = merger.settled(frame)
+        np.testing.assert_allclose(settled.points, instants[frame].points, atol=1e-5)
+        np.testing.assert_allclose(settled.ends, settled.points, atol=1e-5)
+        assert np.abs(scans[frame].points[1] - instants[frame].points[1]).max() > 0.1
+    now = instant(15)
+    regions = BodyRegions.at(merger, now, list(FRAMES), SPEC)
+    (body,) = merger.bodies(now, list(FRAMES), regions)
+    for carried in body.points.voters:
+        np.testing.assert_allclose(carried.points, 0, atol=1e-5)
+    assert len(body.points.voters) == len(FRAMES) - 1
+
+
+def test_points_far_in_time_from_their_frame_are_an_error(tmp_path):
+    for seconds in ([0.0, 5.0], [0.0, np.nan]):
+        feed = TestFeed().feed(tmp_path)
+        FolderSink(tmp_path).sequence("Val/Street/cartesian").write(
+            "seconds", 3, np.array(seconds, np.float32)
+        )
+        (feed.sequence,) = FolderSource(tmp_path).sequences().values()
+        with raises(FormatError, where="seconds of frame 3", found="at point 1"):
+            feed.read(3)

@@ -170,3 +170,28 @@ def test_ends_are_quantiles(count):
     values = np.random.default_rng(count).normal(size=count)
     found = np.ravel(ends(values[:, None]))
     assert found == pytest.approx(np.quantile(values, (0.02, 0.98)), abs=1e-15)
+
+
+@pytest.mark.parametrize("rigid", [True, False])
+def test_points_that_are_seen_one_after_the_other_show_the_path_at_the_times_of_the_scans(rigid):
+    actor = MovingBox((10, 6, 0), speed=10.0)
+    instant = observations_of(actor)
+    # a LiDAR that turns sees the actor later in each scan, half of its points later than the others
+    delays = [
+        0.04 * (frame / 12 - 1) + np.where(np.arange(len(points)) % 2, 0.01, -0.01)
+        for frame, points in enumerate(instant)
+    ]
+    seen = [
+        points + np.outer(delay, (10.0, 0.0, 0.0))
+        for points, delay in zip(instant, delays, strict=True)
+    ]
+    there, velocity, _ = estimate_path(seen, SECONDS, rigid=rigid, delays=delays)
+    expected = estimate_path(instant, SECONDS, rigid=rigid)[0]
+    smeared = estimate_path(seen, SECONDS, rigid=rigid)[0]
+
+    def deviation(path):
+        return np.ptp((path - expected)[:, 0])  # the origin of a body is arbitrary
+
+    assert deviation(there) < 0.2
+    assert deviation(smeared) > 0.5
+    assert np.median(np.linalg.norm(velocity - truth(actor), axis=1)) < 0.3

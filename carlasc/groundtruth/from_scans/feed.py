@@ -24,7 +24,7 @@ from carlasc.core.arrays import (
     IntArray,
     LabelArray,
 )
-from carlasc.core.geometry import Transform, invert, thin, transform_points
+from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan, check_finite, lengths, sorted_by_origin
 from carlasc.errors import FormatError, MissingDataError
@@ -39,6 +39,7 @@ from carlasc.motion import (
     Track,
     ground_points,
     is_fast,
+    moved_back,
     segment_by_boxes,
     segment_by_flow,
     segment_by_instances,
@@ -65,7 +66,10 @@ _USED = (
     "instances",
     "origins",
     "probabilities",
+    "seconds",
 )
+_STEP_S = 0.005  # points of a scan within this time are seen at one instant: 7 cm at 15 m/s
+_LATE_S = 3.0  # no point is farther in time from its frame: see `check_scan`
 _PARTS = 30  # with `window_m`, scans are at least this part of it apart
 
 
@@ -387,7 +391,7 @@ class ScanFeed:
                     self.pose(frame),
                     seconds=self.time(frame),
                     moving=np.flatnonzero(moving),
-                    origins=scan.others.get("origins"),
+                    origins=_places(scan),
                     probabilities=scan.others.get("probabilities"),
                 )
                 # A window of scans and one more: frames are made in order, and the next one needs
@@ -427,9 +431,9 @@ class ScanFeed:
             else None
         )
         labels = _labels(scan) if self.has_labels else None
-        origins = scan.others.get("origins")
+        origins, times = scan.others.get("origins"), scan.others.get("seconds")
         return EvidenceScan(
-            frame, scan.points, pose, self.time(frame), ground, labels, explained, origins
+            frame, scan.points, pose, self.time(frame), ground, labels, explained, origins, times
         )
 
     def segments(self, frame: int, boxes: Sequence_[Track]) -> ScanMotion:
@@ -450,12 +454,16 @@ class ScanFeed:
             )
         segments = self._segments(frame, scan, boxes)
         return ScanMotion(
-            frame, tuple(replace(s, points=thin(s.points, _ACTOR_POINTS)) for s in segments), static
+            frame, tuple(segment.thinned(_ACTOR_POINTS) for segment in segments), static
         )
 
     def _segments(self, frame: int, scan: Scan, boxes: Sequence_[Track]) -> list[Segment]:
         """Return the actors of a scan with all their points."""
         pose, ground, by = self.pose(frame), self.classes.ground, [*self.motion, ""][0]
+        times, flow = scan.others.get("seconds"), scan.flow
+        if times is not None and flow is not None and by in ("flow", "instances"):
+            velocity = np.where(is_fast(flow)[:, None], flow, np.float32(0))
+            scan = replace(scan, points=moved_back(scan.points, times, velocity))
         if by == "flow":
             return segment_by_flow(
                 frame, scan, pose, min_speed_m_s=self.options.motion.min_speed_m_s
@@ -481,12 +489,21 @@ class ScanFeed:
         # Checked before points are left out: a wrong id is an error wherever it is.
         labels = _labels(scan)
         self.classes.check(labels, f"{self.sequence.location}: labels of frame {frame}")
-        origins = scan.others.get("origins")
+        origins, times = scan.others.get("origins"), scan.others.get("seconds")
         voting = (labels > 0) & self._in_range(scan)
-        if origins is None:
+        if origins is not None:
+            check_finite(origins, f"{self.sequence.location}: origins of frame {frame}")
+        if times is not None and not (np.abs(times) <= _LATE_S).all():
+            row = int(np.argmin(np.abs(times) <= _LATE_S))
+            raise FormatError(
+                f"{self.sequence.location}: seconds of frame {frame}",
+                expected=f"times within {_LATE_S:g} s of that of the frame",
+                found=f"{times[row]} at point {row}",
+            )
+        places = _places(scan)
+        if places is None:
             return scan.select(voting)
-        check_finite(origins, f"{self.sequence.location}: origins of frame {frame}")
-        order = sorted_by_origin(origins)
+        order = sorted_by_origin(places)
         return scan.select(order[voting[order]])
 
     def _in_range(self, scan: Scan) -> BoolArray:
@@ -518,6 +535,17 @@ def _restore(key: str, sequence: Sequence, options: FromScans) -> ScanFeed:
         _FEEDS.clear()  # a run processes its sequences one after the other
         _FEEDS[key] = feed
     return feed
+
+
+def _places(scan: Scan) -> Float32Array | None:
+    """Return (N, 3) origins of rays, metres; with the time of each as a fourth column if the scan
+    has times; None if all begin at the sensor, at one time.
+    """
+    origins, times = scan.others.get("origins"), scan.others.get("seconds")
+    if times is None:
+        return origins
+    steps = np.round(times / _STEP_S).astype(np.float32) * np.float32(_STEP_S)
+    return np.column_stack([np.zeros_like(scan.points) if origins is None else origins, steps])
 
 
 def _labels(scan: Scan) -> LabelArray:

@@ -448,7 +448,7 @@ class _FrameSteps:
         """
         if self.now.frame not in self.window:
             return
-        points = self.feed.read(self.now.frame).points
+        points = self.merger.settled(self.now.frame).points
         if self.merger.dynamic == "drop":
             points = points[self.merger.static(self.now.frame)]
         # Other scans may have seen such a voxel free, as a thin object in it stops few rays. A
@@ -493,6 +493,6 @@ class _FrameSteps:
         solid = ~np.isin(made.labels[voxels], sorted(self.feed.classes.ground))
         there_now = self.in_body  # and where the frame's own scan has points
         if self.now.frame in self.window:
-            own = self.feed.read(self.now.frame).points
+            own = self.merger.settled(self.now.frame).points
             there_now = there_now | (self._count(own, self.now.frame) > 0)
         return voxels[solid & ~there_now[voxels]]

@@ -29,12 +29,12 @@ from carlasc.core.arrays import (
 )
 from carlasc.core.cells import as_pose
 from carlasc.core.classes import ClassTable
-from carlasc.core.geometry import Transform, invert, transform_points
+from carlasc.core.geometry import Transform, invert, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import RaysFromPlace, lengths, runs_of_origins
 from carlasc.groundtruth.options import Dynamic
 from carlasc.groundtruth.voting.ballot import ClassPoints, Observation, SeenClass
-from carlasc.motion import BODY_MARGIN_M
+from carlasc.motion import BODY_MARGIN_M, moved_back
 from carlasc.motion.tracks import MovingActors, Track
 from carlasc.storage import layout
 
@@ -103,8 +103,8 @@ class PreparedScan:
         sure: (N,) float32, probability of each label from a network; None: 1.
         ends: (N, 3) float32, the points relative to the origins of their rays, metres: `points`
             themselves if that is the sensor.
-        rays: the rays to the points, by origin: several for several sensors or a sensor that moves
-            during the scan.
+        rays: the rays to the points, by origin and time: several for several sensors or a sensor
+            that moves or turns during the scan.
     """
 
     frame: int
@@ -140,8 +140,9 @@ class PreparedScan:
             world_T_sensor: (4, 4) pose of the scan.
             seconds: time of the scan.
             moving: (M,) indices of the points that move; None: none.
-            origins: (N, 3) origins of the rays, metres, sensor frame; None: all at the sensor.
-                Points with one origin follow each other.
+            origins: (N, 3) origins of the rays, metres, sensor frame, or (N, 4) with their times,
+                seconds after the scan; None: all at the sensor. Points with one row follow each
+                other.
             probabilities: (N, 6) the field of the scan; None: labels are certain.
         """
         reach = float(lengths(points).max(initial=0.0))
@@ -152,7 +153,7 @@ class PreparedScan:
             sure = np.where(probabilities[:, 0] == labels, likely, np.float32(1)).astype(np.float32)
         # Rays are kept relative to their origins; the origin is in the pose of the place, so that
         # the rule of votes is the same for a sensor that moves during the scan.
-        ends = points if origins is None or not origins.any() else points - origins
+        ends = points if origins is None or not origins[:, :3].any() else points - origins[:, :3]
         rays = tuple(
             RaysFromPlace.of(ends, part, origin)
             for part, origin in runs_of_origins(origins, len(points))
@@ -195,19 +196,33 @@ class PreparedScan:
         return np.array([rays.part.stop for rays in self.rays])
 
     def through(
-        self, world_T_box: Transform, lower: FloatArray, upper: FloatArray
+        self, track: Track, lower: FloatArray, upper: FloatArray
     ) -> Iterator[tuple[RaysFromPlace, Transform, Int32Array]]:
-        """Yield the rays from each origin, (4, 4) box_T_place, and the indices of its rays that
-        intersect a box.
+        """Yield the rays of each origin and time, (4, 4) actor_T_place, and the indices of its rays
+        that intersect a box; nothing if the track does not extend to the scan.
 
         Args:
-            world_T_box: (4, 4) pose of the frame in which the box is axis-aligned.
-            lower: (3,) lower corner, metres.
+            track: the actor, which is where it was at the time of the rays.
+            lower: (3,) lower corner of the box, metres, frame of the actor.
             upper: (3,) upper corner.
         """
         for rays in self.rays:
-            box_T_place = invert(world_T_box) @ self.world_T_sensor @ rays.sensor_T_place
-            yield rays, box_T_place, rays.through(box_T_place, lower, upper)
+            if (pose := track.pose(self.frame, rays.seconds)) is not None:
+                actor_T_place = invert(pose) @ self.world_T_sensor @ rays.sensor_T_place
+                yield rays, actor_T_place, rays.through(actor_T_place, lower, upper)
+
+    def at_frame(self, tracks: Iterable[Track]) -> PreparedScan:
+        """Return the scan with the points of tracks where they are at the time of the frame."""
+        if not any(rays.seconds for rays in self.rays):
+            return self
+        times = np.concatenate([np.full(len(rays.points), rays.seconds) for rays in self.rays])
+        points = self.points.copy()
+        for track in tracks:
+            own, velocity = track.members.get(self.frame), track.velocity_at(self.frame)
+            if own is not None and velocity is not None:
+                moves = rotate_vectors(invert(self.world_T_sensor), velocity)
+                points[own] = moved_back(points[own], times[own], moves)
+        return replace(self, points=points, ends=self.ends + (points - self.points))
 
 
 @dataclass(frozen=True)
@@ -273,7 +288,7 @@ class Merger:
 
     def own(self, now: Instant) -> Observation:
         """Return the observation by the frame's own scan, whose rays count everywhere."""
-        scan = self.scan_of(now.frame)
+        scan = self.settled(now.frame)
         places = now.grid_T_world @ scan.world_T_places
         return Observation(scan.ends, self.labels(now.frame), places, scan.runs)
 
@@ -288,7 +303,8 @@ class Merger:
         """
         found = defaultdict[int, list[ClassPoints]](list)
         for other in window:
-            scan, kept, own = self.scan_of(other), self._points[other], other == now.frame
+            kept, own = self._points[other], other == now.frame
+            scan = self.settled(other) if own else self.scan_of(other)
             if own not in kept:
                 all_vote = self.dynamic == "tube" or (own and self.dynamic != "drop")
                 votes = ~self.actors.is_own(scan.points) if all_vote else self.static(other)
@@ -338,10 +354,14 @@ class Merger:
                 votes = SeenClass(track.label, points, regions.of_voxel, region)
                 yield SeenBody(number, pose, casts, votes)
 
+    def settled(self, frame: int) -> PreparedScan:
+        """Return a scan with the points of actors where they are at the time of the frame."""
+        return self.scan_of(frame).at_frame(self.actors.tracks.values())
+
     def moving(self, frame: int) -> Float32Array:
         """Return the (M, 3) moving points of a scan, metres, sensor frame."""
         if frame not in self._moving:
-            self._moving[frame] = self.scan_of(frame).points[~self.static(frame)]
+            self._moving[frame] = self.settled(frame).points[~self.static(frame)]
         return self._moving[frame]
 
     def recent(self, now: Instant, window: Iterable[int]) -> list[int]:
@@ -378,10 +398,7 @@ class Merger:
             for track in self.actors.tracks.values():
                 static[track.members.get(frame, [])] = False
                 lower, upper = track.lower - _AROUND_M, track.upper + _AROUND_M
-                pose = track.pose(frame)
-                for rays, actor_T_place, crossing in (
-                    () if pose is None else scan.through(pose, lower, upper)
-                ):
+                for rays, actor_T_place, crossing in scan.through(track, lower, upper):
                     body = transform_points(actor_T_place, rays.points[crossing])
                     inside = ((body >= lower) & (body <= upper)).all(axis=1)
                     near = rays.part.start + crossing[inside]
@@ -408,13 +425,12 @@ class Merger:
         track = self.actors.tracks[number]
         if not track.rigid and abs(self.scan_of(other).seconds - now.seconds) > _DEFORMABLE_S:
             return None
-        kept, pose = self._carried[other], track.pose(other)
-        if number not in kept and pose is not None:
-            scan = self.scan_of(other)
+        kept, scan = self._carried[other], self.scan_of(other)
+        if number not in kept:
             own = np.zeros(len(scan.points), np.bool_)
             own[track.members.get(other, [])] = True
             rays, hits, places = [], [], []
-            for part, actor_T_place, crossing in scan.through(pose, track.lower, track.upper):
+            for part, actor_T_place, crossing in scan.through(track, track.lower, track.upper):
                 if len(crossing):
                     rays.append(part.points[crossing])
                     seen = rays[-1][own[part.part][crossing]]

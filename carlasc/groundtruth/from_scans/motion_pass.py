@@ -19,7 +19,7 @@ import numpy as np
 
 from carlasc.core.arrays import AnyIntArray, IntArray
 from carlasc.core.geometry import invert, multiply, thin, transform_points
-from carlasc.errors import CarlascError
+from carlasc.errors import CarlascError, count
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.motion import (
     HORIZON_S,
@@ -52,8 +52,8 @@ TRACKS, POSES = "tracks", "poses"
 
 # of the methods: a version changes only when the same input gives another result
 _VERSIONS = {
-    TRACKS: 7,
-    POSES: 1,
+    TRACKS: 8,
+    POSES: 2,
 }
 _NOTED_M = 0.04  # if scans disagree by more and poses do not change, there is a note
 _BATCH = 200  # number of frames between estimates of finished tracks
@@ -310,15 +310,17 @@ def refine_sequence(
         run: how the work is spread. All workers read scans, and this process aligns them.
         steps: called with the number of scans that were read since the last call.
     """
-    frames, mode = feed.frames.tolist(), feed.options.poses.refine
-    file = Kept.of(writer, POSES, feed, run, refine=mode, movable=sorted(feed.classes.movable))
+    frames, options = feed.frames.tolist(), feed.options.poses
+    asked = {"refine": options.refine, "loops": options.loops}
+    file = Kept.of(writer, POSES, feed, run, **asked, movable=sorted(feed.classes.movable))
     refined = file.read(RefinedPoses.from_bytes)
     if refined is not None:
         steps(len(frames))
         return refined
     given = np.stack([feed.pose(frame) for frame in frames])
     with _each(partial(_thin_scan, feed=feed), frames, run) as scans:
-        refined = refine_poses(scans, given, always=mode == "always", steps=steps)
+        always = options.refine == "always"
+        refined = refine_poses(scans, given, always=always, loops=options.loops, steps=steps)
     if writer is not None:
         writer.write_document(file.document, refined.to_bytes(file.key))
     return refined
@@ -357,9 +359,15 @@ def pose_notes(refined: RefinedPoses, frames: IntArray) -> Iterator[str]:
     """Yield a line on the result of the refinement; none if the given poses are good."""
     before, after = (f"{100 * (value or 0.0):.1f} cm" for value in refined.disagreements_m)
     left = ", ".join(f"{a} to {b}" for a, b in refined.left(frames)[:3])
-    if refined.refined.any():
+    if refined.refined.any() and (before != after or not len(refined.loops)):
         but = f"; those of frames {left} were left alone" if left else ""
         yield (f"poses were refined: neighbouring scans disagreed by {before}, now by {after}{but}")
+    if len(refined.loops):
+        was, now = 100 * np.sqrt(np.square(refined.loops[:, 2:]).mean(axis=0))
+        yield (
+            f"{count(len(refined.loops), 'loop')} closed: surfaces that are met again disagreed by "
+            f"{was:.1f} cm, now by {now:.1f} cm"
+        )
     if not refined.fits.all():
         rows = np.flatnonzero(~refined.fits)
         yield (

@@ -302,6 +302,7 @@ class ScanSequence(StoredSequence):
         record |= {} if options.own_path else {"own_path": False}
         record |= {"poses": "kiss-icp"} if self.estimates_poses else {}
         record |= {"refine": options.poses.refine} if self.refines else {}
+        record |= {} if options.poses.loops == "auto" or not self.refines else {"loops": "never"}
         record |= {"window": f"{options.window[0]}:{options.window[1]}", "stride": options.stride}
         record |= {} if options.window_m is None else {"window_m": options.window_m}
         limits = {"min_range_m": self.feed.min_range_m, "max_range_m": self.feed.max_range_m}

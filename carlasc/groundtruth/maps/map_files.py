@@ -74,14 +74,15 @@ class MapCells:
 
 @dataclass(frozen=True)
 class MapFiles:
-    """The paths of a map: points or tree, mesh, distances, trajectory, and the folder of actors;
-    None: not written. `begin` is called before the first file is written.
+    """The paths of a map: points or tree, mesh, distances, trajectory, boxes, and the folder of
+    actors; None: not written. `begin` is called before the first file is written.
     """
 
     out: Path | None
     mesh: Path | None
     distance: Path | None
     trajectory: Path | None
+    boxes: Path | None
     actors: Path | None
     begin: Callable[[], None] = lambda: None
 
@@ -110,10 +111,8 @@ class MapFiles:
                 expected="files of different names",
                 found=", ".join(map(str, paths.values())),
             )
-        if "trajectory" in paths and grid is not None:
-            raise ArgumentError(
-                "trajectory", expected="the map of a drive", found=f"that of {grid}"
-            )
+        for name in paths.keys() & {"trajectory", "boxes_out"} if grid is not None else ():
+            raise ArgumentError(name, expected="the map of a drive", found=f"that of {grid}")
         if "distance" in paths and grid is None:
             raise ArgumentError(
                 "distance",
@@ -131,15 +130,22 @@ class MapFiles:
                 found=str(grid or paths.get("out")),
             )
         folder = paths["out"].with_name(f"{paths['out'].stem}_actors") if actors else None
-        out, mesh, far, trajectory = (paths.get(name) for name in _ENDINGS)
-        return cls(out, mesh, far, trajectory, folder)
+        out, mesh, far, trajectory, boxes = (paths.get(name) for name in _ENDINGS)
+        return cls(out, mesh, far, trajectory, boxes, folder)
 
     @property
     def all(self) -> list[Path]:
         """All files, and the folder."""
         return [
             path
-            for path in (self.out, self.mesh, self.distance, self.trajectory, self.actors)
+            for path in (
+                self.out,
+                self.mesh,
+                self.distance,
+                self.trajectory,
+                self.boxes,
+                self.actors,
+            )
             if path is not None
         ]
 
@@ -185,6 +191,7 @@ _ENDINGS = {
     "mesh": MESH_ENDINGS,
     "distance": (".npz",),
     "trajectory": (".tum", ".txt"),
+    "boxes_out": (".csv", ".json"),
 }
 _BLOCK = 128  # number of cells along x and y that are meshed at once
 _STEPS = (

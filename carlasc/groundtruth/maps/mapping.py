@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import shutil
 from collections.abc import Iterator
 from contextlib import closing
@@ -76,11 +78,16 @@ def write_map(
         points, bodies = drive.write(files), 0
         if files.trajectory is not None:
             drive.write_trajectory(files.trajectory)
+        if files.boxes is not None:
+            drive.write_boxes(files.boxes)
         if files.actors is not None and files.out is not None:
             bodies = drive.write_actors(files.actors, files.out.suffix.lower())
     return MapContent(points, len(drive.frames), bodies, drive.notes())
 
 
+_BOX_COLUMNS = (
+    "time number class x y z length width height heading vx vy vz confidence"  # metres, radians
+).split()
 _BLOCK = 10  # number of scans that a worker sums
 
 
@@ -175,6 +182,36 @@ class DriveMap:
         lines = (" ".join(f"{value:.9g}" for value in row) for row in table.tolist())
         write_atomic(path, "".join(f"{line}\n" for line in lines).encode())
 
+    def write_boxes(self, path: Path) -> None:
+        """Write the box of each moving actor at each scan, in order of actors, then of time."""
+        rows, names = list[dict[str, Any]](), self.inputs.metadata.classes.names
+        signs = (1, -1, 1) if self.inputs.metadata.axes == "left" else (1, 1, 1)
+        times = self.inputs.feed.sequence.times_of(self.frames).tolist()
+        for number, track in self.inputs.actors.tracks.items():
+            middle = (track.lower + track.upper) / 2
+            for frame, seconds in zip(self.frames, times, strict=True):
+                pose, velocity = track.pose(frame), track.velocity_at(frame)
+                if pose is None or velocity is None:
+                    continue
+                ahead = pose[:3, 0] * signs
+                values = {
+                    **dict(zip("xyz", transform_points(pose, middle) * signs, strict=True)),
+                    **dict(zip(("length", "width", "height"), track.size, strict=True)),
+                    "heading": np.arctan2(ahead[1], ahead[0]),
+                    **dict(zip(("vx", "vy", "vz"), velocity * signs, strict=True)),
+                    "confidence": track.confidence,
+                }
+                row = {"time": round(seconds, 6), "number": number, "class": names[track.label]}
+                rows.append(row | {name: round(float(v), 4) for name, v in values.items()})
+        if path.suffix.lower() == ".json":
+            write_atomic(path, to_json(rows))
+            return
+        text = io.StringIO()
+        table = csv.DictWriter(text, _BOX_COLUMNS, lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
+        write_atomic(path, text.getvalue().encode())
+
     def write_actors(self, folder: Path, ending: str) -> int:
         """Write the body of each actor, in its own frame, and its poses; return the number of
         actors.
@@ -247,13 +284,16 @@ class _AddScans:
         if feed.must_find_ground:  # ground that was found had a class for the votes only
             labels[np.isin(labels, sorted(feed.classes.ground))] = feed.classes.geometry_id
         world = transform_points(scan.world_T_sensor, scan.points.astype(np.float64))
+        settled = merger.settled(frame).points if self.actors else scan.points
         chosen: list[tuple[int, AnyArray, FloatArray]] = [
             (STATIC, np.flatnonzero(static), world[static])
         ]
         for number, track in merger.actors.tracks.items() if self.actors else ():
             members, pose = track.members.get(frame), track.pose(frame)
             if members is not None and pose is not None:
-                chosen.append((number, members, transform_points(invert(pose), world[members])))
+                own = settled[members].astype(np.float64)
+                actor_T_sensor = invert(pose) @ scan.world_T_sensor
+                chosen.append((number, members, transform_points(actor_T_sensor, own)))
         for group, points, places in chosen:
             right = places * (1, -1, 1) if feed.sequence.metadata.axes == "left" else places
             sure = None if scan.sure is None else scan.sure[points]

@@ -6,8 +6,11 @@ so any frame can be made separately, in any process, with the same bytes.
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -20,9 +23,17 @@ from carlasc.captures.settings import (
     check_at_least,
     sensor_offsets,
 )
-from carlasc.core.arrays import FloatArray, Uint32Array
-from carlasc.core.geometry import Transform, invert, rotate_vectors, transform_points, translation
+from carlasc.core.arrays import FloatArray, IntArray, Uint32Array
+from carlasc.core.geometry import (
+    Transform,
+    invert,
+    rotate_vectors,
+    slerp,
+    transform_points,
+    translation,
+)
 from carlasc.core.scans import Scan
+from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc_recorders.town.actors import EGO_ID, Population, TownActor
 from carlasc_recorders.town.meshes import Mesh, RayScene, concatenate, rotate_exactly
 from carlasc_recorders.town.town import Town, build_town
@@ -158,6 +169,65 @@ class TownDrive:
         recording = self.record(frame, sensor)
         return replace(recording.scan, flow=recording.flow())
 
+    def sweep(
+        self, frame: int, sensor: int = 0, *, parts: int = 20, phase: float = 0.0
+    ) -> SensorRecording:
+        """Return the recording of a sensor that turns once while everything moves.
+
+        The turn begins half a period before the time of the frame and ends half a period after it.
+        Points are corrected for the motion of the vehicle, as converters do: they are in the frame
+        of the sensor at the time of the frame. The scan has the fields `seconds` and `origins`.
+        Velocities are those at the time of the frame.
+
+        Args:
+            frame: frame number.
+            sensor: number of the sensor.
+            parts: number of parts of the turn; the rays of a part are cast at one instant.
+            phase: part of a turn by which its begin is after azimuth -pi, from 0 to 1.
+
+        Raises:
+            ArgumentError: the frame or the sensor is negative, or there is no part.
+        """
+        check_at_least(0, sensor=sensor)
+        check_at_least(1, parts=parts)
+        now, offset = self.snapshot(frame), translation(self.sensor_offsets(sensor + 1)[sensor])
+        columns, rays = self.lidar.points // self.lidar.channels, len(self.lidar.directions)
+        part_of = ((np.arange(rays) % columns / columns - phase) % 1.0 * parts).astype(np.int64)
+        seconds = ((np.arange(parts) + 0.5) / parts - 0.5) * FRAME_PERIOD_S
+        bound, rng = self.lidar.noise_m, self._random(_NOISE, frame, sensor)
+        noise = rng.uniform(-bound, bound, (rays, 3))
+        paths = self._paths(frame, seconds)
+        static = [actor for id, actor in now.actors.items() if id not in paths]
+        world = self._place(frame, now.world_T_ego, static)
+        pose, scans = now.world_T_ego @ offset, list[Scan]()
+        for part, after_s in enumerate(seconds.tolist()):
+            moved = [
+                replace(now.actors[id], world_T_actor=path[part]) for id, path in paths.items()
+            ]
+            moving = self._place(frame, paths[EGO_ID][part], moved, with_town=False)
+            then = moving.world_T_ego @ offset
+            scan = _cast((world, moving), then, self.lidar, noise, np.flatnonzero(part_of == part))
+            pose_T_then = invert(pose) @ then
+            points = transform_points(pose_T_then, scan.points).astype(np.float32)
+            origins = np.tile(pose_T_then[:3, 3].astype(np.float32), (len(scan), 1))
+            others = {"seconds": np.full(len(scan), after_s, np.float32), "origins": origins}
+            scans.append(replace(scan, points=points, others=others))
+        whole = concatenate_scans(scans)
+        return SensorRecording(whole, pose, _velocities(now, pose, whole))
+
+    def _paths(self, frame: int, seconds: FloatArray) -> dict[int, FloatArray]:
+        """Return the (T, 4, 4) poses of what moves at (T,) times after a frame, by its number; the
+        ego vehicle is the first.
+        """
+        frames = np.arange(max(frame - 1, 0), frame + 2)
+        poses, moving = defaultdict[int, list[Transform]](list), set[int]()
+        for actor in (actor for near in frames.tolist() for actor in self._population.at(near)):
+            poses[actor.id].append(actor.world_T_actor)
+            if actor.id == EGO_ID or actor.velocity.any():
+                moving.add(actor.id)
+        times = (frames - frame) * FRAME_PERIOD_S
+        return {id: slerp(np.stack(poses[id]), times, seconds) for id in sorted(moving)}
+
     def reference_observations(
         self, frame: int, sensors: int = 60, seed: int = 0
     ) -> list[SensorRecording]:
@@ -215,23 +285,30 @@ class TownDrive:
         return self._snapshot
 
     def _take_snapshot(self, frame: int) -> Snapshot:
-        ego = self.ego_pose(frame)
+        return self._place(frame, self.ego_pose(frame), self._population.at(frame))
+
+    def _place(
+        self, frame: int, ego: Transform, actors: list[TownActor], *, with_town: bool = True
+    ) -> Snapshot:
+        """Return actors, and the town unless it is left out, around the ego vehicle."""
         reach = self.lidar.range_m + SENSOR_MARGIN_M
-        actors = {actor.id: actor for actor in self._population.at(frame)}
         near = [
             actor
-            for actor in actors.values()
+            for actor in actors
             if np.hypot(*(actor.world_T_actor[:2, 3] - ego[:2, 3])) < reach + LONGEST_HALF_M
         ]
-        low, high = self._extents
-        nearest = np.clip(ego[:2, 3], low, high) - ego[:2, 3]
-        keep = (nearest**2).sum(axis=1) < reach**2
-        meshes = [self.town.mesh.select(keep)]
-        meshes += [actor.mesh.transformed(actor.world_T_actor) for actor in near]
+        meshes = [actor.mesh.transformed(actor.world_T_actor) for actor in near]
+        owners = [actor.id for actor in near]
+        if with_town:
+            low, high = self._extents
+            nearest = np.clip(ego[:2, 3], low, high) - ego[:2, 3]
+            keep = (nearest**2).sum(axis=1) < reach**2
+            meshes, owners = [self.town.mesh.select(keep), *meshes], [0, *owners]
         counts = [len(mesh.faces) for mesh in meshes]
-        instances = np.repeat(np.array([0, *(actor.id for actor in near)], np.uint32), counts)
+        instances = np.repeat(np.array(owners, np.uint32), counts)
         mesh = concatenate(meshes)
-        return Snapshot(frame, ego, actors, mesh, instances, RayScene(mesh, ego[:3, 3]))
+        by_id = {actor.id: actor for actor in actors}
+        return Snapshot(frame, ego, by_id, mesh, instances, RayScene(mesh, ego[:3, 3]))
 
     @cached_property
     def _extents(self) -> tuple[FloatArray, FloatArray]:
@@ -241,6 +318,16 @@ class TownDrive:
 
     def _random(self, *stream: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, *stream])
+
+
+def concatenate_scans(scans: Sequence[Scan]) -> Scan:
+    """Return the points of several scans with the same fields as one scan."""
+    fields: dict[str, Any] = {
+        name: np.concatenate([vars(scan).get(name, scan.others.get(name)) for scan in scans])
+        for name in ("points", *scans[0].fields())
+    }
+    others = {name: fields.pop(name) for name in scans[0].others}
+    return Scan(**fields, others=others)
 
 
 def scan_snapshot(
@@ -257,24 +344,44 @@ def scan_snapshot(
         lidar: model of the LiDAR.
         rng: source of the noise.
     """
-    world_rays = rotate_exactly(world_T_sensor, lidar.directions)
-    rays, triangles, distances = snapshot.scene.cast(
-        world_T_sensor[:3, 3], world_rays, lidar.range_m
-    )
     noise = rng.uniform(-lidar.noise_m, lidar.noise_m, lidar.directions.shape)
-    labels, instances = snapshot.mesh.labels[triangles], snapshot.instances[triangles]
-    keep = (instances != EGO_ID) & (labels != 0)
-    rays, distances, labels, instances = rays[keep], distances[keep], labels[keep], instances[keep]
-    points = (lidar.directions[rays] * distances[:, None] + noise[rays]).astype(np.float32)
-    scan = Scan(points, labels.astype(np.uint32), None, instances)
-    return SensorRecording(scan, world_T_sensor, _velocities(snapshot, world_T_sensor, instances))
+    scan = _cast((snapshot,), world_T_sensor, lidar, noise)
+    return SensorRecording(scan, world_T_sensor, _velocities(snapshot, world_T_sensor, scan))
 
 
-def _velocities(
-    snapshot: Snapshot, world_T_sensor: Transform, instances: Uint32Array
-) -> FloatArray:
+def _cast(
+    snapshots: Iterable[Snapshot],
+    world_T_sensor: Transform,
+    lidar: Lidar,
+    noise: FloatArray,
+    chosen: IntArray | slice = slice(None),
+) -> Scan:
+    """Return the scan of some rays of a LiDAR, which end at the nearest hit in several snapshots,
+    without points on the ego vehicle and unlabelled ones.
+    """
+    directions, noise = lidar.directions[chosen], noise[chosen]
+    world_rays = rotate_exactly(world_T_sensor, directions)
+    hits = []
+    for one in snapshots:
+        rays, triangles, distances = one.scene.cast(
+            world_T_sensor[:3, 3], world_rays, lidar.range_m
+        )
+        hits.append((rays, distances, one.mesh.labels[triangles], one.instances[triangles]))
+    rays, distances, labels, instances = (np.concatenate(part) for part in zip(*hits, strict=True))
+    order = np.lexsort((distances, rays))
+    nearest = order[np.unique(rays[order], return_index=True)[1]]
+    keep = nearest[(instances[nearest] != EGO_ID) & (labels[nearest] != 0)]
+    rays, distances, labels, instances = (
+        values[keep] for values in (rays, distances, labels, instances)
+    )
+    points = (directions[rays] * distances[:, None] + noise[rays]).astype(np.float32)
+    return Scan(points, labels.astype(np.uint32), None, instances)
+
+
+def _velocities(snapshot: Snapshot, world_T_sensor: Transform, scan: Scan) -> FloatArray:
     """Return (K, 4) id and velocity over ground, m/s, sensor frame, of every actor that was hit."""
-    hit = np.unique(instances[instances != 0])
+    assert scan.instances is not None
+    hit = np.unique(scan.instances[scan.instances != 0])
     velocities = np.array([snapshot.actors[int(id)].velocity for id in hit]).reshape(-1, 3)
     return np.column_stack(
         [hit.astype(np.float64), rotate_vectors(invert(world_T_sensor), velocities)]

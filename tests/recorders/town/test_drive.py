@@ -13,6 +13,7 @@ from carlasc_recorders.town.meshes import MeshBuilder, RayScene
 from helpers.errors import raises
 
 from carlasc.core.geometry import invert, rotate_vectors, rotation_z, transform_points, translation
+from carlasc.core.scans import Scan
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError
 
@@ -364,3 +365,31 @@ def test_a_seed_keeps_its_town_and_its_traffic(drive: TownDrive) -> None:
     points = drive.record(100, 2).scan.points
     assert len(points) == pytest.approx(SEED_3["points"], rel=0.01)
     np.testing.assert_allclose(points.mean(axis=0), SEED_3["scan"], atol=0.05)
+
+
+def test_a_sweep_in_one_part_is_the_scan_of_the_instant(drive: TownDrive) -> None:
+    sweep, instant = drive.sweep(20, parts=1), drive.record(20)
+    np.testing.assert_allclose(sweep.scan.points, instant.scan.points, atol=1e-5)
+    np.testing.assert_array_equal(sweep.scan.instances, instant.scan.instances)
+    assert not sweep.scan.others["seconds"].any()
+    np.testing.assert_allclose(sweep.flow(), instant.flow())
+
+
+def test_a_sweep_sees_each_direction_at_its_time(drive: TownDrive) -> None:
+    seen, instant = drive.sweep(20, parts=10, phase=0.25).scan, drive.record(20).scan
+    times, origins = seen.others["seconds"], seen.others["origins"]
+    turned = (np.arctan2(*(seen.points - origins)[:, 1::-1].T) / (2 * np.pi) + 0.25) % 1.0
+    late = (turned - (times / 0.1 + 0.5) + 0.5) % 1.0 - 0.5
+    assert np.abs(late).max() < 0.06  # half a part, and noise
+
+    # what stands is where it is at the time of the frame, as points are corrected for the motion
+    def heights(scan: Scan) -> float:
+        return float(np.median(scan.points[np.isin(scan.labels, [ROAD]), 2]))
+
+    assert heights(seen) == pytest.approx(heights(instant), abs=0.01)
+    poses = drive.sensor_poses(20, 1)[0], drive.sensor_poses(21, 1)[0]
+    driven = np.linalg.norm(poses[1][:3, 3] - poses[0][:3, 3])
+    last = origins[times > 0.04]
+    assert np.linalg.norm(last[0]) == pytest.approx(0.45 * driven, abs=0.02)
+    with raises(ArgumentError, where="parts"):
+        drive.sweep(20, parts=0)

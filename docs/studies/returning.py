@@ -1,0 +1,99 @@
+"""Drives through the simulated town that come back to streets that they have seen, for
+`poses_loops.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from carlasc_recorders import TownActor, TownDrive
+from carlasc_recorders.town.actors import Population
+from carlasc_recorders.town.streets import HALF_ROAD_M, right_of
+from numpy.typing import NDArray
+
+from carlasc.captures import Lidar
+from carlasc.core.geometry import Transform, rotation_z, translation
+from carlasc.storage.layout import FRAME_PERIOD_S
+
+ROUTES = {
+    "block": [(0, 1), (4, 1), (4, 2), (0, 2), (0, 1), (1, 1)],
+    "there and back": [(0, 0), (0, 1), (4, 1), (4, 2), (0, 2), (0, 1), (0, 0)],
+    "eight": [(1, 2), (4, 2), (4, 1), (0, 1), (0, 2), (4, 2), (4, 3), (0, 3), (0, 2), (2, 2)],
+    "laps": [*[(0, 0), (4, 0), (4, 4), (0, 4)] * 3, (0, 0), (2, 0)],
+}
+"""The crossings, (row, column), of drives of 0.7, 0.8, 1.5 and 3.5 km."""
+_COLUMNS = 5
+_STEP_M = 0.1  # of the path
+_CORNER_M = 9.0  # from a crossing, where a turn begins
+_FAST_M_S, _SIDEWAYS_M_S2 = 10.0, 2.5
+
+
+class _OnRoute(Population):
+    """The actors of a town, with another path of the vehicle that records."""
+
+    def __init__(self, others: Population, poses: Sequence[Transform]) -> None:
+        self._others, self._poses = others, poses
+
+    def ego_pose(self, frame: int) -> Transform:
+        return self._poses[frame]
+
+    def at(self, frame: int) -> list[TownActor]:
+        first, *others = self._others.at(frame)
+        return [replace(first, world_T_actor=self._poses[frame]), *others]
+
+
+class ReturningDrive(TownDrive):
+    """A drive along one of `ROUTES`, in its right lane.
+
+    Attributes:
+        frames: number of frames until its end.
+    """
+
+    def __init__(self, seed: int, route: str, lidar: Lidar | None = None) -> None:
+        """Build the town; the arguments are those of `TownDrive`, and a name of `ROUTES`."""
+        super().__init__(seed, "light", lidar)
+        rows = [row * _COLUMNS + column for row, column in ROUTES[route]]
+        poses = _poses(self.town.streets.nodes[rows])
+        self._population = _OnRoute(self._population, poses)
+        self.frames = len(poses)
+
+
+def _poses(nodes: NDArray[np.float64]) -> list[Transform]:
+    """Return (4, 4) world_T_ego of each frame of a drive past the (N, 2) crossings."""
+    path = [nodes[:1]]
+    for before, node, after in zip(nodes[:-2], nodes[1:-1], nodes[2:], strict=True):
+        one, other = (_towards(node, end, _CORNER_M) for end in (before, after))
+        share = np.linspace(0.0, 1.0, 60)[:, None]
+        path.append(one * (1 - share) ** 2 + 2 * node * share * (1 - share) + other * share**2)
+    lane = _even(np.concatenate([*path, nodes[-1:]]))
+    ahead = np.gradient(lane, axis=0)
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    lane = _even(lane + HALF_ROAD_M / 2 * right_of(ahead))
+    step = np.gradient(lane, axis=0)
+    yaw = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+    bend = np.abs(np.gradient(yaw, _STEP_M))
+    yaw = np.convolve(np.pad(yaw, 10, mode="edge"), np.full(21, 1 / 21), mode="valid")
+    slow = np.array([bend[max(0, i - 60) : i + 60].max() for i in range(len(bend))])
+    speed = np.minimum(_FAST_M_S, np.sqrt(_SIDEWAYS_M_S2 / np.maximum(slow, 1e-3)))
+    times = np.concatenate([[0.0], np.cumsum(_STEP_M / speed[1:])])
+    at = np.arange(0.0, times[-1], FRAME_PERIOD_S)
+    x, y, turn = (np.interp(at, times, values) for values in (*lane.T, yaw))
+    return [
+        translation((*place, 0.0)) @ rotation_z(angle)
+        for *place, angle in zip(x.tolist(), y.tolist(), turn.tolist(), strict=True)
+    ]
+
+
+def _towards(
+    start: NDArray[np.float64], end: NDArray[np.float64], way: float
+) -> NDArray[np.float64]:
+    return np.asarray(start + way * (end - start) / np.linalg.norm(end - start))
+
+
+def _even(path: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points of a path, `_STEP_M` apart."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    at = np.arange(0.0, along[-1], _STEP_M)
+    return np.column_stack([np.interp(at, along, path[:, axis]) for axis in (0, 1)])
