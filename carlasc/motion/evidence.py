@@ -691,22 +691,21 @@ def _look(azimuth, steep, flat, far, start, slope, distance):  # type: ignore[no
     half = _SIDE_M / flat + _SIDE_RAD
     high = half * (1 + steep * steep)
     near, beyond = far - _DEPTH_M - _DEPTH_SHARE * far, far + _DEPTH_M + _DEPTH_SHARE * far
-    # Most places are occupied, and the middle column usually shows it: it comes first.
-    middle = math.floor((azimuth + math.pi) * _PER_RAD) % _COLUMNS
-    lo, end = _first_above(steep - high, start[middle], start[middle + 1], slope), start[middle + 1]
-    while lo < end and slope[lo] <= steep + high:
-        if near <= distance[lo] <= beyond:
-            return HIT
-        lo += 1
-    first = math.floor((azimuth - half + math.pi) * _PER_RAD)
-    last = math.floor((azimuth + half + math.pi) * _PER_RAD)
+    first, middle, last = (
+        math.floor((azimuth - half + math.pi) * _PER_RAD),
+        math.floor((azimuth + math.pi) * _PER_RAD),
+        math.floor((azimuth + half + math.pi) * _PER_RAD),
+    )
     # A hit decides at once, for any ray. A ray that ends before the place hides it, even if others
     # pass: then the place is at an edge, and unknown. So all columns of the window are needed.
     passed, hidden = 0, 0
     below, above = -1e9, 1e9
     below_range, above_range = 0.0, 0.0
-    for c in range(first, last + 1):
-        column = (c + _COLUMNS) % _COLUMNS
+    for c in range(first - 1, last + 1):
+        # Most places are occupied, and the middle column usually shows it: it comes first.
+        if c == middle:
+            continue
+        column = (middle if c < first else c) % _COLUMNS
         lo, end = (
             _first_above(steep - high, start[column], start[column + 1], slope),
             start[column + 1],
