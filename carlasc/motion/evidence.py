@@ -140,10 +140,8 @@ class FreeSpaceEvidence:
         if not self.times:
             return replace(self, points=tuple(thin(points, most) for points in self.points))
         rows = [spread_rows(len(points), most) for points in self.points]
-        points, times = (
-            tuple(own[kept] for own, kept in zip(parts, rows, strict=True))
-            for parts in (self.points, self.times)
-        )
+        points = tuple(own[kept] for own, kept in zip(self.points, rows, strict=True))
+        times = tuple(own[kept] for own, kept in zip(self.times, rows, strict=True))
         return replace(self, points=points, times=times)
 
     @property
