@@ -5,6 +5,7 @@ import pytest
 
 from carlasc.core.scans import Scan
 from carlasc.motion import Segment, segment_by_flow, segment_by_instances, static_actor_points
+from carlasc.motion.segments import spread_rows
 
 CAR, PERSON = 10, 4
 
@@ -123,3 +124,13 @@ def test_a_number_in_two_places_or_of_two_velocities_has_a_segment_for_each():
         assert np.sort(np.concatenate([segment.members for segment in segments])).tolist() == list(
             range(40)
         )
+
+
+@pytest.mark.parametrize("count", [0, 3, 400, 401, 8235])
+def test_rows_are_spread_without_a_period(count):
+    rows = spread_rows(count, 400)
+    assert len(rows) == min(count, 400)
+    assert (np.diff(rows) > 0).all()
+    assert (rows < count).all()
+    if count > 1000:
+        assert np.bincount(rows % 32, minlength=32).min() >= 6  # points of all 32 channels
