@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from carlasc.core.arrays import AnyFloatArray, Float32Array, FloatArray
+from carlasc.core.arrays import AnyFloatArray, Float32Array, FloatArray, IntArray
 from carlasc.errors import FormatError
 
 Floating = TypeVar("Floating", bound=np.floating[Any])
@@ -26,6 +26,7 @@ Transform = FloatArray
 _SIGNS = np.array([1, -1, 1, 1], np.float32)
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 _FARTHEST_M = 1e9  # larger than any distance on Earth
+_GOLDEN = 0.6180339887  # multiples of it, without their integers, are spread evenly
 
 
 def rotation_z(yaw_rad: float) -> Transform:
@@ -73,6 +74,27 @@ def transform_points(dst_T_src: Transform, points: AnyFloatArray) -> FloatArray:
 def thin(points: NDArray[Floating], most: int) -> NDArray[Floating]:
     """Return every N-th row of an array, with the smallest N that gives at most `most` rows."""
     return points[:: max(1, -(-len(points) // most))]
+
+
+def spread_rows(count: int, most: int) -> IntArray:
+    """Return at most `most` of the rows 0 to `count` - 1, spread evenly, but not at one distance:
+    points of a LiDAR that turns are in order of columns, and every N-th may be of few channels.
+    """
+    steps, apart = np.arange(min(count, most)), max(1.0, count / most)
+    return np.asarray(steps * apart + (apart - 1) * (steps * _GOLDEN % 1.0), np.int64)
+
+
+def moved_back(
+    points: NDArray[Floating], times: AnyFloatArray | None, velocity: AnyFloatArray
+) -> NDArray[Floating]:
+    """Return where points are at the time of their frame, which were seen some seconds after it.
+
+    Args:
+        points: (N, 3) metres.
+        times: (N,) seconds; None: the points stay.
+        velocity: (3,) or (N, 3) m/s, on the axes of the points.
+    """
+    return points if times is None else (points - times[:, None] * velocity).astype(points.dtype)
 
 
 def rotate_vectors(dst_T_src: Transform, vectors: AnyFloatArray) -> FloatArray:

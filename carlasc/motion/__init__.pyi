@@ -22,7 +22,6 @@ from .options import RefineMode as RefineMode
 from .segments import Segment as Segment
 from .segments import StaticPoints as StaticPoints
 from .segments import is_fast as is_fast
-from .segments import moved_back as moved_back
 from .segments import segment_by_flow as segment_by_flow
 from .segments import segment_by_instances as segment_by_instances
 from .segments import static_actor_points as static_actor_points

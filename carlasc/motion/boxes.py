@@ -16,11 +16,18 @@ import numpy as np
 
 from carlasc.core.arrays import FloatArray, IntArray, LabelArray
 from carlasc.core.boxes import Boxes
-from carlasc.core.geometry import Transform, invert, multiply, rotation_z, transform_points
+from carlasc.core.geometry import (
+    Transform,
+    invert,
+    moved_back,
+    multiply,
+    rotation_z,
+    transform_points,
+)
 from carlasc.core.scans import Scan, finite
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent
 from carlasc.motion.paths import MIN_POINTS, best_observation, corrections
-from carlasc.motion.segments import MIN_SPEED_M_S, Segment, moved_back
+from carlasc.motion.segments import MIN_SPEED_M_S, Segment
 from carlasc.motion.solving import nearest_rotation, resample, smooth
 from carlasc.motion.tracks import Track
 

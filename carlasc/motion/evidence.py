@@ -37,11 +37,10 @@ from carlasc.core.arrays import (
 )
 from carlasc.core.cells import Pose, as_pose, distinct, fast_azimuth, joined, numbered, transform
 from carlasc.core.compiling import cached, inlined
-from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
+from carlasc.core.geometry import Transform, invert, multiply, spread_rows, thin, transform_points
 from carlasc.core.scans import finite, runs_of_origins
 from carlasc.errors import FormatError
 from carlasc.motion.ground import ground_points
-from carlasc.motion.segments import spread_rows
 
 HORIZON_S = 5.0  # fact: horizon
 """Scans up to this many seconds before and after a scan are looked up."""

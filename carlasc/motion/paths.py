@@ -18,9 +18,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from carlasc.core.arrays import AnyFloatArray, FloatArray
-from carlasc.core.geometry import invert, multiply, rotation_z, thin, transform_points
+from carlasc.core.geometry import invert, moved_back, multiply, rotation_z, thin, transform_points
 from carlasc.motion.planes import Planes, nearest_points, pose_of, register
-from carlasc.motion.segments import moved_back
 from carlasc.motion.solving import fast_rows, headings_of, resample, smooth, smooth_at
 
 MIN_POINTS = 10  # observations with fewer points are interpolated from the others

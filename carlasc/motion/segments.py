@@ -6,10 +6,16 @@ from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray, IntArray
-from carlasc.core.geometry import Floating, Transform, rotate_vectors, thin, transform_points
+from carlasc.core.geometry import (
+    Transform,
+    moved_back,
+    rotate_vectors,
+    spread_rows,
+    thin,
+    transform_points,
+)
 from carlasc.core.scans import Scan
 
 MIN_SPEED_M_S = 0.3  # slower points count as static: estimated flow is never exactly zero
@@ -23,7 +29,6 @@ _BESIDE_M = 1.0
 _SAME_VELOCITY_M_S = 0.5  # greatest difference of flow within one rigid actor
 
 _REST_M = 0.5  # margin around an actor in which its static points are searched for
-_GOLDEN = 0.6180339887  # multiples of it, without their integers, are spread evenly
 LINKED_M_S = 2.0  # maximum change of an actor's velocity between two segments
 
 
@@ -69,27 +74,6 @@ class Segment:
         """Return the same with its points moved to the time of the frame, by (3,) m/s, world."""
         points = moved_back(self.points, self.times, velocity)
         return self if self.times is None else replace(self, points=points, times=None)
-
-
-def spread_rows(count: int, most: int) -> IntArray:
-    """Return at most `most` of the rows 0 to `count` - 1, spread evenly, but not at one distance:
-    points of a LiDAR that turns are in order of columns, and every N-th may be of few channels.
-    """
-    steps, apart = np.arange(min(count, most)), max(1.0, count / most)
-    return np.asarray(steps * apart + (apart - 1) * (steps * _GOLDEN % 1.0), np.int64)
-
-
-def moved_back(
-    points: NDArray[Floating], times: AnyFloatArray | None, velocity: AnyFloatArray
-) -> NDArray[Floating]:
-    """Return where points are at the time of their frame, which were seen some seconds after it.
-
-    Args:
-        points: (N, 3) metres.
-        times: (N,) seconds; None: the points stay.
-        velocity: (3,) or (N, 3) m/s, on the axes of the points.
-    """
-    return points if times is None else (points - times[:, None] * velocity).astype(points.dtype)
 
 
 def is_fast(flow: AnyFloatArray, min_speed_m_s: float = MIN_SPEED_M_S) -> BoolArray:

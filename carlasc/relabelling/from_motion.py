@@ -10,7 +10,7 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray, BoolArray, Float32Array, FloatArray, Uint32Array
 from carlasc.core.frames import FrameRange
-from carlasc.core.geometry import invert, rotate_vectors, transform_points
+from carlasc.core.geometry import invert, moved_back, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, check_types
 from carlasc.groundtruth.from_scans.actor_voxels import velocity_at
@@ -19,7 +19,6 @@ from carlasc.groundtruth.from_scans.sequences import ScanSequence
 from carlasc.groundtruth.inputs import GridPlan
 from carlasc.groundtruth.options import FromScans, Voting
 from carlasc.motion.ground import ground_points
-from carlasc.motion.segments import moved_back
 from carlasc.motion.tracks import MovingActors, Track
 from carlasc.relabelling.copies import timed, write_in_stages
 from carlasc.running.spreading import Run, StepCounter

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from carlasc.core.geometry import spread_rows
 from carlasc.core.scans import Scan
 from carlasc.motion import Segment, segment_by_flow, segment_by_instances, static_actor_points
-from carlasc.motion.segments import spread_rows
 
 CAR, PERSON = 10, 4
 

@@ -24,7 +24,7 @@ from carlasc.core.arrays import (
     IntArray,
     LabelArray,
 )
-from carlasc.core.geometry import Transform, invert, transform_points
+from carlasc.core.geometry import Transform, invert, moved_back, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan, check_finite, lengths, sorted_by_origin
 from carlasc.errors import FormatError, MissingDataError
@@ -39,7 +39,6 @@ from carlasc.motion import (
     Track,
     ground_points,
     is_fast,
-    moved_back,
     segment_by_boxes,
     segment_by_flow,
     segment_by_instances,

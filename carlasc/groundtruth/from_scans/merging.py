@@ -29,12 +29,12 @@ from carlasc.core.arrays import (
 )
 from carlasc.core.cells import as_pose
 from carlasc.core.classes import ClassTable
-from carlasc.core.geometry import Transform, invert, rotate_vectors, transform_points
+from carlasc.core.geometry import Transform, invert, moved_back, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import RaysFromPlace, lengths, runs_of_origins
 from carlasc.groundtruth.options import Dynamic
 from carlasc.groundtruth.voting.ballot import ClassPoints, Observation, SeenClass
-from carlasc.motion import BODY_MARGIN_M, moved_back
+from carlasc.motion import BODY_MARGIN_M
 from carlasc.motion.tracks import MovingActors, Track
 from carlasc.storage import layout
 
