@@ -26,11 +26,10 @@ from carlasc.core.geometry import Transform
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, MissingDataError, check_choice, check_types
 from carlasc.running.processes import run_all
-from carlasc.running.spreading import Run, StepCounter
+from carlasc.running.spreading import Run, StepCounter, check_shared
 from carlasc.storage.camera_files import cameras_to_json
 from carlasc.storage.files import AnyPath
 from carlasc.storage.layout import CAMERAS, FRAME_PERIOD_S
-from carlasc.storage.transport.remote_tree import check_shared
 
 SETTINGS_FILE = "simulation.json"
 TOWN = "town"

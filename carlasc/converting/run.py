@@ -41,7 +41,7 @@ from carlasc.inspection.findings import Finding
 from carlasc.motion.ground import Ground, joined
 from carlasc.motion.options import PoseOptions
 from carlasc.running.processes import one_pool
-from carlasc.running.spreading import Part, Run, StepCounter
+from carlasc.running.spreading import Part, Run, StepCounter, check_shared
 from carlasc.storage.files import AnyPath
 from carlasc.storage.inputs import (
     PROVISIONAL,
@@ -54,7 +54,6 @@ from carlasc.storage.inputs import (
 from carlasc.storage.layout import METADATA, Metadata, place_of
 from carlasc.storage.opening import as_sink
 from carlasc.storage.protocol import Sequence, Sink, Source
-from carlasc.storage.transport.remote_tree import check_shared
 from carlasc.storage.transport.trees import LocalTarget
 
 Grids = GridOptions | Literal["voxels"] | None

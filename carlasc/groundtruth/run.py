@@ -51,7 +51,7 @@ from carlasc.groundtruth.options import FromCapture, FromScans, Observe, Voting
 from carlasc.groundtruth.reporting import Changes, FrameFacts, Report, sample_frames
 from carlasc.groundtruth.seen import check_views, see_voxels
 from carlasc.running.processes import one_pool, run_all
-from carlasc.running.spreading import Run, StepCounter
+from carlasc.running.spreading import Run, StepCounter, check_shared
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath, parse_json, to_json
 from carlasc.storage.opening import as_sink
@@ -66,7 +66,6 @@ from carlasc.storage.resuming import (
     check_scan,
 )
 from carlasc.storage.shares import Share, source_in
-from carlasc.storage.transport.remote_tree import check_shared
 from carlasc.storage.transport.trees import is_url
 
 RULES = {"capture": 1, "scans": 4, "grid": 1}

@@ -235,3 +235,17 @@ def count_cores() -> int:
     """Return the number of cores that this process may use."""
     cores_of = getattr(os, "sched_getaffinity", None)  # macOS has no such function
     return len(cores_of(0)) if cores_of else os.cpu_count() or 1
+
+
+def check_shared(location: str, run: Run) -> None:
+    """Check that all processes of a run can access the output: `memory://` exists in one process
+    only.
+
+    Raises:
+        ArgumentError: the output is in memory, and the run has several processes.
+    """
+    if location.startswith("memory://") and not run.is_alone:
+        found = "an executor" if run.executor is not None else str(run.processes)
+        raise ArgumentError(
+            "workers", expected=f"1 with {location}, which exists in one process only", found=found
+        )

@@ -18,7 +18,7 @@ import numpy as np
 from carlasc.core.arrays import AnyArray
 from carlasc.errors import ConflictError, check_types
 from carlasc.running.processes import run_all
-from carlasc.running.spreading import Part, Run, StepCounter
+from carlasc.running.spreading import Part, Run, StepCounter, check_shared
 from carlasc.storage import layout
 from carlasc.storage.files import AnyPath, unfinished
 from carlasc.storage.folder import FolderSink
@@ -27,7 +27,6 @@ from carlasc.storage.opening import as_source
 from carlasc.storage.packed.output import put_in_place
 from carlasc.storage.protocol import Sequence, SequenceWriter, Sink, Source
 from carlasc.storage.shares import Share
-from carlasc.storage.transport.remote_tree import check_shared
 from carlasc.storage.transport.trees import is_url
 
 Progress = Callable[[int, int], None]

@@ -13,7 +13,6 @@ from functools import lru_cache, partial
 from typing import Any, TypeVar
 
 from carlasc.errors import ArgumentError, MissingDataError, without_credentials
-from carlasc.running.spreading import Run
 from carlasc.storage.files import AnyPath
 from carlasc.storage.transport.clients import HUB, Client, FileSystemClient
 from carlasc.storage.transport.failures import WrongAnswerError, fail
@@ -378,17 +377,3 @@ def target_of(out: AnyPath | Target, **storage_options: Any) -> Target:
         if is_url(text)
         else LocalTarget(text.removeprefix("file://"))
     )
-
-
-def check_shared(location: str, run: Run) -> None:
-    """Check that all processes of a run can access the output: `memory://` exists in one process
-    only.
-
-    Raises:
-        ArgumentError: the output is in memory, and the run has several processes.
-    """
-    if location.startswith("memory://") and not run.is_alone:
-        found = "an executor" if run.executor is not None else str(run.processes)
-        raise ArgumentError(
-            "workers", expected=f"1 with {location}, which exists in one process only", found=found
-        )

@@ -29,6 +29,7 @@ from helpers.servers.object_store import (
 
 import carlasc
 from carlasc import Run
+from carlasc.running.spreading import check_shared
 from carlasc.errors import (
     ArgumentError,
     CarlascError,
@@ -44,7 +45,6 @@ from carlasc.storage.transport.remote_tree import (
     RemoteFile,
     RemoteTarget,
     RemoteTree,
-    check_shared,
     target_of,
 )
 from carlasc.storage.transport.requests import RemoteSettings
