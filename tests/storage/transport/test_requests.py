@@ -29,7 +29,6 @@ from helpers.servers.object_store import (
 
 import carlasc
 from carlasc import Run
-from carlasc.running.spreading import check_shared
 from carlasc.errors import (
     ArgumentError,
     CarlascError,
@@ -38,6 +37,7 @@ from carlasc.errors import (
     StorageError,
     without_credentials,
 )
+from carlasc.running.spreading import check_shared
 from carlasc.storage import FolderSink
 from carlasc.storage.opening import as_sink
 from carlasc.storage.packing import pack
