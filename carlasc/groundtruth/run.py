@@ -68,7 +68,7 @@ from carlasc.storage.resuming import (
 from carlasc.storage.shares import Share, source_in
 from carlasc.storage.transport.trees import is_url
 
-RULES = {"capture": 1, "scans": 4, "grid": 1}
+RULES = {"capture": 1, "scans": 5, "grid": 1}
 """Version of the rule that makes grids, by what observes the scene.
 
 It changes only when the same input gives other grids.

@@ -95,7 +95,7 @@ def test_a_grid_that_carlasc_0_1_0_made_from_scans_is_not_continued_since_scans_
     }
     path.write_text(json.dumps(params | {"carlasc": {"version": "0.1.0", **record}}))
     before = read_tree(street)
-    with pytest.raises(ConflictError, match="carlasc.rule 1 where this run has 4"):
+    with pytest.raises(ConflictError, match="carlasc.rule 1 where this run has 5"):
         regrid(street, passing_car.SPEC, name="mine", run=Run(workers=1))
     assert read_tree(street) == before
     assert (
