@@ -320,7 +320,7 @@ def _prepare(
     }
     needed = {name: data for name, data in documents.items() if data is not None}
     is_other = writer.read_document(layout.params_file(plan.grid)) != to_json(params)
-    replaces = exists and (overwrite or is_other)
+    replaces = exists and (overwrite or (check.is_provisional and is_other))
     return SequenceJob(path, inputs, plan, writer, needed, params, replaces, check)
 
 
