@@ -131,20 +131,30 @@ def removal(drive: Drive, settings: Settings) -> dict[int, Grid]:
     points are removed that all of them remove. With `ground`, points below the height of the ground
     are kept.
     """
-    library, scans = importlib.import_module("dynamic_object_removal"), in_world(drive)
+    scans = in_world(drive)
     points = np.concatenate([p for p, _ in scans.values()])
     sweeps = [(p, pose[:3, 3]) for p, pose in scans.values()]
-    keep = np.zeros(len(points), np.bool_)
-    for name, options in settings["cleaners"].items():
-        heights = [origin[2] for _, origin in sweeps]
-        ground = {"ground_z": float(np.median(heights)) - SENSOR_M + 0.2}
-        extra = ground if settings.get("ground") and name == "visibility" else {}
-        keep |= getattr(library, f"clean_map_by_{name}")(points, sweeps, **options, **extra)[1]
+    keep = kept_by_removal(points, sweeps, settings)
     parts = np.split(keep, np.cumsum([len(p) for p, _ in scans.values()])[:-1])
     return merge(
         Cleaned(drive.scans, dict(zip(scans, parts, strict=True))),
         FromScans(WINDOW, dynamic="tube"),
     )
+
+
+def kept_by_removal(
+    points: np.ndarray, sweeps: list[tuple[np.ndarray, np.ndarray]], settings: Settings
+) -> np.ndarray:
+    """Return which (N, 3) points of a map dynamic-object-removal keeps; sweeps are the points and
+    the origin of each scan, on the axes of the map.
+    """
+    library, keep = importlib.import_module("dynamic_object_removal"), np.zeros(len(points), bool)
+    for name, options in settings["cleaners"].items():
+        heights = [origin[2] for _, origin in sweeps]
+        ground = {"ground_z": float(np.median(heights)) - SENSOR_M + 0.2}
+        extra = ground if settings.get("ground") and name == "visibility" else {}
+        keep |= getattr(library, f"clean_map_by_{name}")(points, sweeps, **options, **extra)[1]
+    return keep
 
 
 def octomap(drive: Drive, settings: Settings) -> dict[int, Grid]:

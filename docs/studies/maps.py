@@ -13,22 +13,24 @@ faster than 1 m/s at any time of the drive. Drives are those of `movers.py`: WOR
 results; the default is a temporary folder.
 
 The rows of other programs need `pip install dufomap dynamic-object-removal` (DUFOMap: Python 3.12
-or older); rows without them are left out. The row of dynamic-object-removal takes five minutes of
-CPU time per drive, the others less than one.
+or older); rows without them are left out. Their settings are those of `makers_rivals.py`: what
+their authors advise for few channels, and the best ones on other drives.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import study
+from makers_rivals import RIVALS, Settings, kept_by_removal
 from movers_drives import MOVES_M_S, Recorded, record
 from movers_rows import BARE, Changed, Only, find_static, noisy_boxes
 from numpy.typing import NDArray
@@ -44,11 +46,14 @@ from carlasc.storage.views import ChosenSequences
 
 CELL_M, NEAR_M = 0.05, 0.05
 CHANNELS = 32
-SEEDS = {"town": range(61, 63), "street": range(261, 263)}
+SEEDS = {"town": range(61, 66), "street": range(261, 266)}
 POSES = PoseOptions("file", "never")  # which are exact
 WIDTH, HEIGHT, PIXELS_PER_M = 1200, 560, 15.0
 AZIMUTH, ELEVATION = np.radians(-35), np.radians(38)
 Keep = dict[int, NDArray[np.bool_]]
+# Each program, its maker in makers_rivals.py, and the best of the settings there for maps, by AA on
+# drives apart: `maps.py WORK --town 51 --street 201 --rows all`.
+PROGRAMS = {"DUFOMap": ("dufomap", 4), "dynamic-object-removal": ("removal", 7)}
 
 
 @dataclass(frozen=True)
@@ -81,20 +86,35 @@ def dynamic_points(drive: Recorded) -> Keep:
     }
 
 
-def by_dynamic_object_removal(points: NDArray[np.float32], drive: Recorded) -> NDArray[np.float32]:
-    """Return the points of a map that the package's best method (`fusion`) keeps, with its own
-    settings.
-    """
-    # pip install dynamic-object-removal
-    from dynamic_object_removal import clean_map_by_fusion  # noqa: PLC0415
+def by_dufomap(drive: Recorded, settings: Settings) -> Sequence:
+    """Return a drive with the points that DUFOMap calls static."""
+    return without(drive, find_static(drive, **settings))
 
-    scans = []
+
+def by_dynamic_object_removal(
+    points: NDArray[np.float32], drive: Recorded, settings: Settings
+) -> NDArray[np.float32]:
+    """Return the points of a map that dynamic-object-removal keeps."""
+    sweeps = []
     for frame in drive.sequence.frames("points").tolist():
         pose = drive.sequence.read_pose(frame)
         own = transform_points(pose, drive.sequence.read("points", frame)[:, :3].astype(np.float64))
-        scans.append((own * (1, -1, 1), (pose[:3, 3] * (1, -1, 1)).tolist()))
-    kept, _ = clean_map_by_fusion(points.astype(np.float64), scans)
-    return kept.astype(np.float32)
+        sweeps.append((own * (1, -1, 1), pose[:3, 3] * (1, -1, 1)))
+    return points[kept_by_removal(points.astype(np.float64), sweeps, settings)]
+
+
+def rivals() -> Iterator[MapRow]:
+    """Yield a row of each setting of other programs: the advised one, the best one, and others."""
+    for program, (kind, best) in PROGRAMS.items():
+        (rival,) = [one for one in RIVALS.values() if one.make.__name__ == kind]
+        for place, settings in enumerate(rival.settings):
+            about = {0: "advised", best: "best of a sweep"}.get(place, str(place))
+            row = MapRow(f"{program}; {about}", MotionOptions("none"), needs=rival.module or "")
+            if kind == "dufomap":
+                yield replace(row, change=partial(by_dufomap, settings=settings))
+            else:
+                clean = partial(by_dynamic_object_removal, settings=settings)
+                yield replace(row, change=lambda d: Only(d.sequence, BARE), clean=clean)
 
 
 ROWS = (
@@ -105,7 +125,6 @@ ROWS = (
         lambda d: without(d, {f: ~own for f, own in dynamic_points(d).items()}),
     ),
     MapRow("carlasc, flow", MotionOptions("flow")),
-    MapRow("carlasc, exact boxes", MotionOptions("boxes")),
     MapRow("carlasc, boxes", MotionOptions("boxes"), lambda drive: noisy_boxes(drive, 0)),
     MapRow("carlasc, free space", MotionOptions("evidence")),
     MapRow(
@@ -113,14 +132,7 @@ ROWS = (
         MotionOptions("evidence"),
         lambda drive: Only(drive.sequence, BARE),
     ),
-    MapRow("DUFOMap", MotionOptions("none"), lambda d: without(d, find_static(d)), "dufomap"),
-    MapRow(
-        "dynamic-object-removal",
-        MotionOptions("none"),
-        lambda drive: Only(drive.sequence, BARE),
-        "dynamic_object_removal",
-        by_dynamic_object_removal,
-    ),
+    *rivals(),
 )
 
 
@@ -201,7 +213,10 @@ def main() -> None:
     """Measure all rows, and print the table."""
     parser = study.options(__doc__, SEEDS)
     parser.add_argument(
-        "--rows", nargs="+", default=[row.name for row in ROWS], help="only these rows"
+        "--rows",
+        nargs="+",
+        default=[row.name for row in ROWS if not row.name[-1].isdigit()],
+        help="only these rows; all: also all settings of other programs",
     )
     parser.add_argument("--draw", type=Path, help="a map")
     with study.begin(parser) as given:
@@ -211,7 +226,8 @@ def main() -> None:
         rows = [
             row
             for row in ROWS
-            if (not row.needs or find_spec(row.needs)) and row.name in given.rows
+            if (not row.needs or find_spec(row.needs))
+            and (row.name in given.rows or given.rows == ["all"])
         ]
         found: dict[str, list[dict[str, Any]]] = {row.name: [] for row in rows}
         for kind, seed in study.drives(given, SEEDS):

@@ -228,18 +228,20 @@ def without_what_dufomap_finds(drive: Recorded, frame: int) -> Sequence:
     return Changed(drive.sequence, keep=keep)
 
 
-def find_static(drive: Recorded) -> dict[int, NDArray[np.bool_]]:
-    """Return which points of each scan DUFOMap calls static, with the parameters of its paper; the
-    result is kept beside the drive.
+def find_static(
+    drive: Recorded, cell_m: float = 0.1, hits_m: float = 0.2, unknown: int = 1
+) -> dict[int, NDArray[np.bool_]]:
+    """Return which points of each scan DUFOMap calls static, with the parameters of its paper or
+    others; the result is kept beside the drive.
     """
-    path = drive.folder / "dufomap.npz"
+    path = drive.folder / f"dufomap {cell_m:g} {hits_m:g} {unknown}.npz"
     frames = drive.sequence.frames("points").tolist()
     if not path.exists():
         from dufomap import dufomap  # noqa: PLC0415 (pip install "carlasc[study]")
 
         scans = {f: drive.sequence.read("points", f)[:, :3].astype(np.float64) for f in frames}
         poses = {f: np.asarray(drive.sequence.read_pose(f)) for f in frames}
-        finder = dufomap(0.1, 0.2, 1, num_threads=1)
+        finder = dufomap(cell_m, hits_m, unknown, num_threads=1)
         finder.setCluster(0, 20, 0.2)
         for f in frames:
             finder.run(scans[f], poses[f], cloud_transform=True)
