@@ -19,7 +19,7 @@ from .options import MotionSource as MotionSource
 from .options import PoseOptions as PoseOptions
 from .options import PoseSource as PoseSource
 from .options import RefineMode as RefineMode
-from .segments import Segment as Segment
+from .paths import Segment as Segment
 from .segments import StaticPoints as StaticPoints
 from .segments import is_fast as is_fast
 from .segments import segment_by_flow as segment_by_flow

@@ -26,8 +26,8 @@ from carlasc.core.geometry import (
 )
 from carlasc.core.scans import Scan, finite
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent
-from carlasc.motion.paths import MIN_POINTS, best_observation, corrections
-from carlasc.motion.segments import MIN_SPEED_M_S, Segment
+from carlasc.motion.paths import MIN_POINTS, Segment, best_observation, corrections
+from carlasc.motion.segments import MIN_SPEED_M_S
 from carlasc.motion.solving import nearest_rotation, resample, smooth
 from carlasc.motion.tracks import Track
 

@@ -19,9 +19,8 @@ from carlasc.motion.evidence import (
     FreeSpaceEvidence,
     cells_around,
 )
-from carlasc.motion.paths import estimate_path, is_static, middles_of, misalignment
+from carlasc.motion.paths import Segment, estimate_path, is_static, middles_of, misalignment
 from carlasc.motion.planes import nearest_points
-from carlasc.motion.segments import Segment
 from carlasc.motion.solving import best_pairs
 
 _MAX_GAP_S = 1.0  # an actor may be hidden for this long

@@ -14,7 +14,8 @@ from itertools import islice
 import numpy as np
 
 from carlasc.core.arrays import FloatArray
-from carlasc.motion.segments import LINKED_M_S, Segment, StaticPoints
+from carlasc.motion.paths import Segment
+from carlasc.motion.segments import LINKED_M_S, StaticPoints
 from carlasc.motion.solving import best_pairs
 
 _MAX_GAP_S = 1.55  # an actor may be hidden for this time

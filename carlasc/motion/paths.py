@@ -14,11 +14,20 @@ not.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from carlasc.core.arrays import AnyFloatArray, FloatArray
-from carlasc.core.geometry import invert, moved_back, multiply, rotation_z, thin, transform_points
+from carlasc.core.arrays import AnyFloatArray, FloatArray, IntArray
+from carlasc.core.geometry import (
+    invert,
+    moved_back,
+    multiply,
+    rotation_z,
+    spread_rows,
+    thin,
+    transform_points,
+)
 from carlasc.motion.planes import Planes, nearest_points, pose_of, register
 from carlasc.motion.solving import fast_rows, headings_of, resample, smooth, smooth_at
 
@@ -48,6 +57,50 @@ _SLOW_M_S, _END_POINTS = (
 )
 _SAME_WIDTH_M = 0.12  # greatest difference of the widths of the same ends
 _GAIN = 0.3  # weight of the last correction in the estimate of the motion
+
+
+@dataclass(frozen=True)
+class Segment:
+    """The points of one actor in one scan.
+
+    Attributes:
+        frame: frame number.
+        label: most frequent class of its points.
+        members: (M,) int64 indices of the points in the scan.
+        points: (M, 3) float64 metres, world.
+        velocity: (3,) m/s, world; None if the scan has no flow.
+        instance: number of the actor; 0 if actors are not numbered.
+        origin: (3,) position of the sensor, metres, world.
+        times: (M,) seconds of `points` after the time of the frame; None if they are unknown, or
+            the points are where they are at that time.
+    """
+
+    frame: int
+    label: int
+    members: IntArray
+    points: FloatArray
+    velocity: FloatArray | None
+    instance: int = 0
+    origin: FloatArray = field(default_factory=lambda: np.zeros(3))
+    times: AnyFloatArray | None = None
+
+    @property
+    def center(self) -> FloatArray:
+        """(3,) centre of the points' bounding box, metres, world."""
+        center: FloatArray = (self.points.min(axis=0) + self.points.max(axis=0)) / 2
+        return center
+
+    def thinned(self, most: int) -> Segment:
+        """Return the same with at most `most` of the points; `members` stay complete."""
+        if self.times is None:
+            return replace(self, points=thin(self.points, most))
+        rows = spread_rows(len(self.points), most)
+        return replace(self, points=self.points[rows], times=self.times[rows])
+
+    def at_frame(self, velocity: FloatArray) -> Segment:
+        """Return the same with its points moved to the time of the frame, by (3,) m/s, world."""
+        points = moved_back(self.points, self.times, velocity)
+        return self if self.times is None else replace(self, points=points, times=None)
 
 
 def estimate_path(

@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray, IntArray
-from carlasc.core.geometry import (
-    Transform,
-    moved_back,
-    rotate_vectors,
-    spread_rows,
-    thin,
-    transform_points,
-)
+from carlasc.core.geometry import Transform, rotate_vectors, transform_points
 from carlasc.core.scans import Scan
+from carlasc.motion.paths import Segment
 
 MIN_SPEED_M_S = 0.3  # slower points count as static: estimated flow is never exactly zero
 _CELL_M = 0.4  # size of the cells in which moving points are grouped
@@ -30,50 +24,6 @@ _SAME_VELOCITY_M_S = 0.5  # greatest difference of flow within one rigid actor
 
 _REST_M = 0.5  # margin around an actor in which its static points are searched for
 LINKED_M_S = 2.0  # maximum change of an actor's velocity between two segments
-
-
-@dataclass(frozen=True)
-class Segment:
-    """The points of one actor in one scan.
-
-    Attributes:
-        frame: frame number.
-        label: most frequent class of its points.
-        members: (M,) int64 indices of the points in the scan.
-        points: (M, 3) float64 metres, world.
-        velocity: (3,) m/s, world; None if the scan has no flow.
-        instance: number of the actor; 0 if actors are not numbered.
-        origin: (3,) position of the sensor, metres, world.
-        times: (M,) seconds of `points` after the time of the frame; None if they are unknown, or
-            the points are where they are at that time.
-    """
-
-    frame: int
-    label: int
-    members: IntArray
-    points: FloatArray
-    velocity: FloatArray | None
-    instance: int = 0
-    origin: FloatArray = field(default_factory=lambda: np.zeros(3))
-    times: AnyFloatArray | None = None
-
-    @property
-    def center(self) -> FloatArray:
-        """(3,) centre of the points' bounding box, metres, world."""
-        center: FloatArray = (self.points.min(axis=0) + self.points.max(axis=0)) / 2
-        return center
-
-    def thinned(self, most: int) -> Segment:
-        """Return the same with at most `most` of the points; `members` stay complete."""
-        if self.times is None:
-            return replace(self, points=thin(self.points, most))
-        rows = spread_rows(len(self.points), most)
-        return replace(self, points=self.points[rows], times=self.times[rows])
-
-    def at_frame(self, velocity: FloatArray) -> Segment:
-        """Return the same with its points moved to the time of the frame, by (3,) m/s, world."""
-        points = moved_back(self.points, self.times, velocity)
-        return self if self.times is None else replace(self, points=points, times=None)
 
 
 def is_fast(flow: AnyFloatArray, min_speed_m_s: float = MIN_SPEED_M_S) -> BoolArray:

@@ -32,8 +32,8 @@ from carlasc.core.geometry import (
 )
 from carlasc.errors import reading
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent, Sizes, measure, surface_of
-from carlasc.motion.paths import estimate_path, is_static
-from carlasc.motion.segments import MIN_SPEED_M_S, Segment
+from carlasc.motion.paths import Segment, estimate_path, is_static
+from carlasc.motion.segments import MIN_SPEED_M_S
 from carlasc.motion.solving import headings_of, resample
 from carlasc.storage.arrays import ArrayFormat, open_npz
 from carlasc.storage.files import parse_json
