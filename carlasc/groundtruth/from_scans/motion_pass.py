@@ -81,7 +81,7 @@ def _find_evidence(
     # labels that are often wrong must not split actors
     movable = feed.classes.movable if feed.trusts_ground_labels else ()
     found = find_evidence(scans, movable=movable, frames=frozenset(block))
-    return [evidence.thinned() for evidence in found]
+    return list(map(FreeSpaceEvidence.thinned, found))
 
 
 def _make_track(actor: _Observed, times: dict[int, float], deformable: frozenset[int]) -> Track:
