@@ -76,19 +76,20 @@ def others(drive: Drive, frame: int) -> list[int]:
     return [f for f in drive.hidden if WINDOW[0] <= f - frame <= WINDOW[1] and f != frame]
 
 
-def evidence(drive: Drive, frame: int, other: int) -> Grid:
-    """Return what a held-out scan alone shows in the grid of a frame; of scans at other times, only
-    what cannot move.
-    """
+def observed(drive: Drive, frame: int, other: int) -> Observation:
+    """Return a held-out scan, seen from a frame; of scans at other times, only what cannot move."""
     scan = drive.whole.scan(other, ("labels",))
     labels = study.labels_of(scan)
     keep = labels > 0
     if other != frame:
         keep &= ~np.isin(labels, sorted(CARLA.movable))
     motion = invert(drive.whole.read_pose(frame)) @ drive.whole.read_pose(other)
-    return count_votes(
-        [Observation(scan.points[keep], labels[keep], motion)], SPEC, CARLA
-    ).to_grid()
+    return Observation(scan.points[keep], labels[keep], motion)
+
+
+def evidence(drive: Drive, frame: int, other: int) -> Grid:
+    """Return what a held-out scan alone shows in the grid of a frame."""
+    return count_votes([observed(drive, frame, other)], SPEC, CARLA).to_grid()
 
 
 def depth_error(drive: Drive, grids: dict[int, Grid]) -> float:
@@ -98,15 +99,10 @@ def depth_error(drive: Drive, grids: dict[int, Grid]) -> float:
     found = []
     for frame, grid in grids.items():
         for other in (frame, *others(drive, frame)):
-            scan = drive.whole.scan(other, ("labels",))
-            labels = study.labels_of(scan)
-            keep = labels > 0
-            if other != frame:
-                keep &= ~np.isin(labels, sorted(CARLA.movable))
-            motion = invert(drive.whole.read_pose(frame)) @ drive.whole.read_pose(other)
-            points = transform_points(motion, scan.points[keep])
+            seen = observed(drive, frame, other)
+            points = transform_points(seen.grid_T_sensor, seen.points)
             points = points[SPEC.flat_index(points) >= 0]
-            origins = np.broadcast_to(motion[:3, 3], points.shape)
+            origins = np.broadcast_to(seen.grid_T_sensor[:3, 3], points.shape)
             occupied = grid.known & (grid.labels > 0)
             found.append(depth_errors(occupied, SPEC, origins, points).mean())
     return float(np.mean(found))
