@@ -179,11 +179,18 @@ def convert(
         follow_ground=not bounded,
     )
     if follow:
-        if run.part or run.sequences_from or run.cluster or chosen or "frames" in written.values:
+        parts = {
+            "--part": run.part,
+            "--sequences-from": run.sequences_from,
+            "--cluster": run.cluster,
+            "--sequences": chosen,
+            "--frames": "frames" in written.values,
+        }
+        if asked := [name for name, given in parts.items() if given]:
             raise ArgumentError(
                 "--follow",
                 expected="one recording, whole, on this machine",
-                found="--part, --sequences-from, --cluster, --sequences or --frames",
+                found=", ".join(asked),
             )
         carlasc.converting.follow(
             name,
