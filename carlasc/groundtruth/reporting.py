@@ -156,8 +156,10 @@ def _distances(one: AnyFloatArray, other: AnyFloatArray) -> AnyFloatArray:
     """
     nearest_m = []
     for asked, others in ((one, other), (other, one)):
-        squares = np.square(thin(asked, _MOST_ASKED)[:, None] - others[None]).sum(axis=2)
-        nearest_m.append(np.sqrt(squares.min(axis=1)))
+        axes = zip(thin(asked, _MOST_ASKED).T, others.T, strict=True)
+        # several times faster axis by axis than point by point
+        squares = sum(np.square(a[:, None] - b) for a, b in axes)
+        nearest_m.append(np.sqrt(np.min(squares, axis=1)))
     return np.concatenate(nearest_m)
 
 

@@ -24,7 +24,7 @@ from carlasc.core.arrays import (
     IntArray,
     LabelArray,
 )
-from carlasc.core.geometry import Transform, invert, moved_back, transform_points
+from carlasc.core.geometry import invert, moved_back, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan, check_finite, lengths, sorted_by_origin
 from carlasc.errors import FormatError, MissingDataError
@@ -348,11 +348,15 @@ class ScanFeed:
         first, last = self.options.window
         corners, map_T_world = _corners(plan.spec), invert(self.pose(int(self.frames[0])))
 
+        @cache
+        def corners_of(frame: int) -> FloatArray:
+            return transform_points(self.pose(frame), corners)
+
         def cast_of(frame: int, within_s: float) -> Cast:
             # of all frames, made or not: counts do not depend on which frames are made
             near = self.frames[(self.frames >= frame - last) & (self.frames <= frame - first)]
             grids = [
-                transform_points(self.pose(other), corners)
+                corners_of(other)
                 for other in near.tolist()
                 if abs(self.times[other] - self.times[frame]) <= within_s
             ]

@@ -132,17 +132,14 @@ class ScanFrame(FrameInput):
         last = frame + feed.options.window[1]
         for number, track in self.inputs.actors.tracks.items():
             later = min((other for other in track.members if frame < other <= last), default=None)
-            here, there = track.pose(frame), None if later is None else track.pose(later)
-            own, others = (
-                track.members.get(frame, ()),
-                () if later is None else track.members[later],
-            )
-            if later is None or here is None or there is None or not len(own) or not len(others):
+            if later is None or frame not in track.members:
+                continue
+            here, there = track.pose(frame), track.pose(later)
+            own, others = track.members[frame], track.members[later]
+            if here is None or there is None or not len(own) or not len(others):
                 continue
             one, other = (
-                transform_points(
-                    feed.pose(f), feed.read(f).points[list(members)].astype(np.float64)
-                )
+                transform_points(feed.pose(f), feed.read(f).points[members].astype(np.float64))
                 for f, members in ((frame, own), (later, others))
             )
             by_actor[number] = Residual.between(one, other, here, there)
