@@ -304,6 +304,18 @@ class _FrameSteps:
         """(V,) bool: the voxels of bodies."""
         return self.regions.of_voxel != STATIC
 
+    @cached_property
+    def returned(self) -> tuple[IntArray, Int32Array]:
+        """The voxels with points of the frame's own scan, increasing, and their numbers of points;
+        none if the scan is not merged.
+        """
+        return self._returned(slice(None if self.now.frame in self.window else 0))
+
+    def _returned(self, chosen: BoolArray | slice) -> tuple[IntArray, Int32Array]:
+        counts = self._count(self.merger.settled(self.now.frame).points[chosen], self.now.frame)
+        voxels = np.flatnonzero(counts)
+        return voxels, counts[voxels]
+
     def decide_seen(self, votes: Votes, consensus: ClassConsensus | None) -> _UnfinishedGrid:
         """Return the grid from the votes for the static scene and in the bodies of actors, with the
         classes of the consensus.
@@ -448,15 +460,14 @@ class _FrameSteps:
         """
         if self.now.frame not in self.window:
             return
-        points = self.merger.settled(self.now.frame).points
-        if self.merger.dynamic == "drop":
-            points = points[self.merger.static(self.now.frame)]
         # Other scans may have seen such a voxel free, as a thin object in it stops few rays. A
         # return is an outlier only if very many rays passed; fewer are enough if it is alone.
-        returns = self._count(points, self.now.frame)
-        returned = np.flatnonzero(returns)
-        lost = returned[(made.labels[returned] == 0) & (consensus.labels[returned] > 0)]
-        is_single = (returns[lost] == 1) & ~_have_neighbours(lost, returned, self.plan.spec)
+        returned, returns = self.returned
+        if self.merger.dynamic == "drop":
+            returned, returns = self._returned(self.merger.static(self.now.frame))
+        is_lost = (made.labels[returned] == 0) & (consensus.labels[returned] > 0)
+        lost = returned[is_lost]
+        is_single = (returns[is_lost] == 1) & ~_have_neighbours(lost, returned, self.plan.spec)
         rows = votes.occupied[np.isin(votes.occupied["voxel"], lost)]
         hits = np.bincount(np.searchsorted(lost, rows["voxel"]), rows["votes"], len(lost))
         free = votes.free.reshape(-1)[lost]
@@ -491,8 +502,5 @@ class _FrameSteps:
                 self._count(body, other, path)
         voxels = np.flatnonzero((path > 0) & (made.labels > 0))
         solid = ~np.isin(made.labels[voxels], sorted(self.feed.classes.ground))
-        there_now = self.in_body  # and where the frame's own scan has points
-        if self.now.frame in self.window:
-            own = self.merger.settled(self.now.frame).points
-            there_now = there_now | (self._count(own, self.now.frame) > 0)
-        return voxels[solid & ~there_now[voxels]]
+        is_there_now = self.in_body[voxels] | np.isin(voxels, self.returned[0])
+        return voxels[solid & ~is_there_now]
