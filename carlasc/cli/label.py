@@ -60,7 +60,7 @@ def label(
                 found=f"--{name}",
             )
     if predictions == "motion":
-        options = replace(options, name=boxes.name, values=options.values | boxes.values)
+        options = replace(options, name=boxes.name, values={**options.values, **boxes.values})
         _label_motion(source, out, motion, options, run, json)
         return
     for name, given in (("motion", motion), ("boxes_out", boxes)):

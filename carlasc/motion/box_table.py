@@ -147,7 +147,8 @@ class BoxTable:
             numbers = np.array([int(float(row["number"])) for row in rows], np.int64)
             times = np.array([float(row["time"]) for row in rows])
             values = [
-                [float(row.get(name, _DEFAULTS.get(name))) for name in _NUMBERS] for row in rows
+                [float(row.get(name, _DEFAULTS.get(name, np.nan))) for name in _NUMBERS]
+                for row in rows
             ]
         try:
             return cls(times, numbers, tuple(str(row["class"]) for row in rows), np.array(values))
