@@ -115,7 +115,7 @@ def assert_as_plain(observations: list[Observation], spec: GridSpec, **options: 
     np.testing.assert_array_equal(grid.labels, labels)
     np.testing.assert_array_equal(grid.counts, counts)
     np.testing.assert_array_equal(votes.free.reshape(-1), plain[:, 0])
-    np.testing.assert_array_equal(votes.occupied_counts().reshape(-1), plain[:, 1:].sum(axis=1))
+    np.testing.assert_array_equal(votes.elect_occupied()[1], plain[:, 1:].sum(axis=1))
 
 
 @pytest.mark.parametrize("spec", SPECS.values(), ids=SPECS)

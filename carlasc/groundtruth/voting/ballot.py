@@ -392,11 +392,6 @@ class Votes:
         kernel.elect(self.occupied, labels, counts)
         return labels, counts
 
-    def occupied_counts(self) -> IntArray:
-        """Return (X, Y, Z) int64: votes for all classes except free space."""
-        counts = np.bincount(self.occupied["voxel"], self.occupied["votes"], self.spec.num_voxels)
-        return counts.astype(np.int64).reshape(self.spec.size)
-
     def to_sparse(self) -> AnyArray:
         """Return the votes as the layout stores them: non-zero ones only, sorted by voxel, then by
         label; free space is label 0.
