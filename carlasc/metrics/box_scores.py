@@ -13,7 +13,7 @@ from carlasc.core.boxes import mirror_boxes
 from carlasc.core.geometry import invert, mirror_poses, transform_points
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_types, import_extra
 from carlasc.metrics.confusion import json_number
-from carlasc.metrics.results import FigureTable
+from carlasc.metrics.results import Cell, FigureTable
 from carlasc.motion import BoxTable, tracks_from_boxes
 from carlasc.storage import Source, as_source
 from carlasc.storage.files import AnyPath
@@ -73,7 +73,7 @@ class BoxScores:
         """Return the scores as a table, shares in percent."""
         units = ("Heading [deg]", "Velocity [m/s]")
         header = ("Objects", "IoU", "Boxes", "AP", "Precision", "Recall", "MOTA", "Switches")
-        rows = [
+        rows: list[tuple[Cell, ...]] = [
             (*one[:2], str(one.boxes), *(100 * share for share in one[3:7]), str(one[7]), *one[8:])
             for one in self.scores
         ]
@@ -148,9 +148,9 @@ def evaluate_boxes(
     sequence, numbers = having[0], having[0].frames("boxes")
     times, frames = sequence.times_of(numbers), numbers.tolist()
     poses = np.stack([sequence.read_pose(frame) for frame in frames])
-    boxes = {f: own for f in frames if (own := sequence.boxes(f)) is not None}
+    boxes = {f: given for f in frames if (given := sequence.boxes(f)) is not None}
     if sequence.metadata.axes == "left":
-        poses, boxes = mirror_poses(poses), {f: mirror_boxes(own) for f, own in boxes.items()}
+        poses, boxes = mirror_poses(poses), {f: mirror_boxes(b) for f, b in boxes.items()}
     pose_of = dict(zip(frames, poses, strict=True))
     tracks = tracks_from_boxes(boxes, pose_of, dict(zip(frames, times.tolist(), strict=True)))
 
