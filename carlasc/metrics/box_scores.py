@@ -281,10 +281,10 @@ def _average_precision(ranked: list[tuple[float, bool]], total: int) -> float:
 
 def _overlaps(true: FloatArray, found: FloatArray) -> FloatArray:
     """Return the (T, D) IoU of (T, 5) and (D, 5) rectangles: x, y, length, width, heading."""
-    apart = np.hypot(*(true[:, None, :2] - found[:, :2]).transpose(2, 0, 1))
-    reach = np.hypot(*true[:, 2:4].T)[:, None] + np.hypot(*found[:, 2:4].T)
-    iou = np.zeros(apart.shape)
-    for row, column in np.argwhere(apart < reach / 2).tolist():
+    iou = np.zeros((len(true), len(found)))
+    apart = np.hypot(*(true[:, None, :2] - found[:, :2]).T).T
+    near = apart < (true[:, 2:4].sum(axis=1)[:, None] + found[:, 2:4].sum(axis=1)) / 2
+    for row, column in np.argwhere(near).tolist():
         a, b = true[row], found[column]
         shared = _shared_area(a, b)
         iou[row, column] = shared / (a[2] * a[3] + b[2] * b[3] - shared)
@@ -292,22 +292,20 @@ def _overlaps(true: FloatArray, found: FloatArray) -> FloatArray:
 
 
 def _shared_area(a: FloatArray, b: FloatArray) -> float:
-    """Return the area, square metres, of two rectangles' intersection: the corners of one, in the
-    frame of the other, are cut at each of its four sides.
+    """Return the area, square metres, of the intersection of two rectangles.
+
+    The corners of one, as complex numbers in the frame of the other, are cut at each of its sides.
     """
-    signs = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
-    to_a, turn = np.exp(-1j * a[4]), np.exp(1j * (b[4] - a[4]))
-    place = complex(*(b[:2] - a[:2])) * to_a + (signs * b[2:4] / 2) @ [1, 1j] * turn
-    corners = list(zip(place.real.tolist(), place.imag.tolist(), strict=True))
-    for axis, side in ((0, 1), (0, -1), (1, 1), (1, -1)):
-        cut = list[tuple[float, float]]()
+    turned = np.array([1 + 1j, -1 + 1j, -1 - 1j, 1 - 1j])
+    own = (turned.real * b[2] + 1j * turned.imag * b[3]) / 2 * np.exp(1j * b[4])
+    corners = ((own + complex(*b[:2]) - complex(*a[:2])) * np.exp(-1j * a[4])).tolist()
+    for half in (*a[2:4] / 2, *a[2:4] / 2):
+        cut = list[complex]()
         for p, q in zip(corners, corners[1:] + corners[:1], strict=True):
-            inside, following = (a[2 + axis] / 2 - side * point[axis] for point in (p, q))
-            if inside >= 0:
+            if p.real <= half:
                 cut.append(p)
-            if inside * following < 0:
-                part = inside / (inside - following)
-                cut.append((p[0] + part * (q[0] - p[0]), p[1] + part * (q[1] - p[1])))
-        corners = cut
+            if (p.real <= half) != (q.real <= half):
+                cut.append(p + (q - p) * (half - p.real) / (q.real - p.real))
+        corners = [corner * -1j for corner in cut]  # the next side lies ahead
     pairs = zip(corners, corners[1:] + corners[:1], strict=True)
-    return float(abs(sum(p[0] * q[1] - q[0] * p[1] for p, q in pairs)) / 2)
+    return abs(sum((p.conjugate() * q).imag for p, q in pairs)) / 2
