@@ -58,7 +58,7 @@ def write_drive(folder, boxes, poses, axes="right"):
 def boxes_at(middles, size=SIZE):
     """Boxes along x at (x, y), by number."""
     world_T_box = np.tile(np.eye(4), (len(middles), 1, 1))
-    world_T_box[:, :2, 3] = list(middles.values())
+    world_T_box[:, :2, 3] = np.reshape(list(middles.values()), (-1, 2))
     numbers, labels = np.array(list(middles), np.uint32), np.full(len(middles), 10, np.uint32)
     return Boxes.from_poses(numbers, labels, world_T_box, np.tile(size, (len(middles), 1)))
 
@@ -178,3 +178,16 @@ def test_the_command_prints_what_the_function_returns(drive, tmp_path):
     assert made.stdout.startswith("Objects,IoU,Boxes,AP,") and "moving,0.50,27," in made.stdout
     for option in ("--rays", "--all-conventions"):
         assert CliRunner().invoke(app, [*typed, option]).exit_code == 2
+
+
+def test_frames_without_boxes_and_one_annotated_frame(tmp_path):
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    write_drive(tmp_path / "empty", {0: boxes_at({}), 2: boxes_at({})}, poses)
+    scores = by(evaluate_boxes(table_of([(0, 1, 5, 0, 0.0, 1)]), tmp_path / "empty"))
+    assert scores["all", 0.5].precision == 0 and math.isnan(scores["all", 0.5].mota)
+    write_drive(tmp_path / "one", {1: boxes_at({1: (5, 0)})}, poses)
+    scores = by(evaluate_boxes(table_of([(1, 1, 5, 0, 0.0, 1)]), tmp_path / "one"))
+    assert scores["all", 0.5].mota == 1 and scores["moving", 0.5].boxes == 0
+    (tmp_path / "one/Val/Street/cartesian/poses.txt").unlink()
+    with raises(MissingDataError, where="poses.txt"):
+        evaluate_boxes(table_of([(1, 1, 5, 0, 0.0, 1)]), tmp_path / "one")
