@@ -8,9 +8,9 @@ street with `--motion flow` and `none`.
 
 The measures are those of DynamicMap_Benchmark (Q. Zhang et al., ITSC 2023), by points: SA is the
 share of the static points within 5 cm of a point of the map, DA the share of the dynamic ones
-without such a point, AA the square root of their product, HA their harmonic mean. A point is dynamic if its actor moves
-faster than 1 m/s at any time of the drive. Drives are those of `movers.py`: WORK keeps them, and
-results; the default is a temporary folder.
+without such a point, AA the square root of their product, HA their harmonic mean. A point is
+dynamic if its actor moves faster than 1 m/s at any time of the drive. Drives are those of
+`movers.py`: WORK keeps them, and results; the default is a temporary folder.
 
 The rows of other programs need `pip install dufomap dynamic-object-removal` (DUFOMap: Python 3.12
 or older); rows without them are left out. Their settings are those of `makers_rivals.py`: what
