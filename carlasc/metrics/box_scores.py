@@ -13,7 +13,7 @@ from carlasc.core.boxes import mirror_boxes
 from carlasc.core.geometry import invert, mirror_poses, transform_points
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_types, import_extra
 from carlasc.metrics.confusion import json_number
-from carlasc.metrics.results import FigureTable
+from carlasc.metrics.results import Cell, FigureTable
 from carlasc.motion import BoxTable, tracks_from_boxes
 from carlasc.storage import Source, as_source
 from carlasc.storage.files import AnyPath
@@ -73,7 +73,7 @@ class BoxScores:
         """Return the scores as a table, shares in percent."""
         units = ("Heading [deg]", "Velocity [m/s]")
         header = ("Objects", "IoU", "Boxes", "AP", "Precision", "Recall", "MOTA", "Switches")
-        rows = [
+        rows: list[tuple[Cell, ...]] = [
             (*one[:2], str(one.boxes), *(100 * share for share in one[3:7]), str(one[7]), *one[8:])
             for one in self.scores
         ]
@@ -148,9 +148,9 @@ def evaluate_boxes(
     sequence, numbers = having[0], having[0].frames("boxes")
     times, frames = sequence.times_of(numbers), numbers.tolist()
     poses = np.stack([sequence.read_pose(frame) for frame in frames])
-    boxes = {f: own for f in frames if (own := sequence.boxes(f)) is not None}
+    boxes = {f: given for f in frames if (given := sequence.boxes(f)) is not None}
     if sequence.metadata.axes == "left":
-        poses, boxes = mirror_poses(poses), {f: mirror_boxes(own) for f, own in boxes.items()}
+        poses, boxes = mirror_poses(poses), {f: mirror_boxes(b) for f, b in boxes.items()}
     pose_of = dict(zip(frames, poses, strict=True))
     tracks = tracks_from_boxes(boxes, pose_of, dict(zip(frames, times.tolist(), strict=True)))
 
@@ -281,10 +281,10 @@ def _average_precision(ranked: list[tuple[float, bool]], total: int) -> float:
 
 def _overlaps(true: FloatArray, found: FloatArray) -> FloatArray:
     """Return the (T, D) IoU of (T, 5) and (D, 5) rectangles: x, y, length, width, heading."""
-    apart = np.hypot(*(true[:, None, :2] - found[:, :2]).transpose(2, 0, 1))
-    reach = np.hypot(*true[:, 2:4].T)[:, None] + np.hypot(*found[:, 2:4].T)
-    iou = np.zeros(apart.shape)
-    for row, column in np.argwhere(apart < reach / 2).tolist():
+    iou = np.zeros((len(true), len(found)))
+    apart = np.hypot(*(true[:, None, :2] - found[:, :2]).T).T
+    near = apart < (true[:, 2:4].sum(axis=1)[:, None] + found[:, 2:4].sum(axis=1)) / 2
+    for row, column in np.argwhere(near).tolist():
         a, b = true[row], found[column]
         shared = _shared_area(a, b)
         iou[row, column] = shared / (a[2] * a[3] + b[2] * b[3] - shared)
@@ -292,22 +292,20 @@ def _overlaps(true: FloatArray, found: FloatArray) -> FloatArray:
 
 
 def _shared_area(a: FloatArray, b: FloatArray) -> float:
-    """Return the area, square metres, of two rectangles' intersection: the corners of one, in the
-    frame of the other, are cut at each of its four sides.
+    """Return the area, square metres, of the intersection of two rectangles.
+
+    The corners of one, as complex numbers in the frame of the other, are cut at each of its sides.
     """
-    signs = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
-    to_a, turn = np.exp(-1j * a[4]), np.exp(1j * (b[4] - a[4]))
-    place = complex(*(b[:2] - a[:2])) * to_a + (signs * b[2:4] / 2) @ [1, 1j] * turn
-    corners = list(zip(place.real.tolist(), place.imag.tolist(), strict=True))
-    for axis, side in ((0, 1), (0, -1), (1, 1), (1, -1)):
-        cut = list[tuple[float, float]]()
+    turned = np.array([1 + 1j, -1 + 1j, -1 - 1j, 1 - 1j])
+    own = (turned.real * b[2] + 1j * turned.imag * b[3]) / 2 * np.exp(1j * b[4])
+    corners = ((own + complex(*b[:2]) - complex(*a[:2])) * np.exp(-1j * a[4])).tolist()
+    for half in (*a[2:4] / 2, *a[2:4] / 2):
+        cut = list[complex]()
         for p, q in zip(corners, corners[1:] + corners[:1], strict=True):
-            inside, following = (a[2 + axis] / 2 - side * point[axis] for point in (p, q))
-            if inside >= 0:
+            if p.real <= half:
                 cut.append(p)
-            if inside * following < 0:
-                part = inside / (inside - following)
-                cut.append((p[0] + part * (q[0] - p[0]), p[1] + part * (q[1] - p[1])))
-        corners = cut
+            if (p.real <= half) != (q.real <= half):
+                cut.append(p + (q - p) * (half - p.real) / (q.real - p.real))
+        corners = [corner * -1j for corner in cut]  # the next side lies ahead
     pairs = zip(corners, corners[1:] + corners[:1], strict=True)
-    return float(abs(sum(p[0] * q[1] - q[0] * p[1] for p, q in pairs)) / 2)
+    return abs(sum((p.conjugate() * q).imag for p, q in pairs)) / 2

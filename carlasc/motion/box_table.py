@@ -65,13 +65,11 @@ class BoxTable:
         for valid, expected in (
             (whole, "finite numbers in all columns but those of the velocity"),
             ((self.values[:, 3:6] > 0).all(axis=1), "a length, width and height above 0 metres"),
-            (first, "one box per number and time"),
+            (first, "one box per time and number"),
         ):
             if not valid.all():
                 row = int(valid.argmin())
                 found = f"{[*keys[row].tolist(), *self.values[row].tolist()]}"
-                if valid is first:
-                    found = f"another one of number {keys[row, 1]:.0f} at {keys[row, 0]} s"
                 raise FormatError(
                     f"row {row + 1}", expected=expected, found=found, advice="remove it, or mend it"
                 )
@@ -165,12 +163,13 @@ class BoxTable:
         """
         path = Path(path)
         check_box_file("boxes_out", path)
-        columns = (self.times, self.numbers, self.classes, *self.values.T)
-        table = {
-            name: list(column) if name == "class" else np.asarray(column).tolist()
-            for name, column in zip(_COLUMNS, columns, strict=True)
-        }
-        rows = [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
+        columns = (
+            self.times.tolist(),
+            self.numbers.tolist(),
+            self.classes,
+            *self.values.T.tolist(),
+        )
+        rows = [dict(zip(_COLUMNS, row, strict=True)) for row in zip(*columns, strict=True)]
         text = io.StringIO()
         match path.suffix.lower():
             case ".json":
@@ -183,7 +182,9 @@ class BoxTable:
             case _:
                 made = io.BytesIO()
                 pa = import_extra("pyarrow", "parquet")
-                import_extra("pyarrow.parquet", "parquet").write_table(pa.table(table), made)
+                import_extra("pyarrow.parquet", "parquet").write_table(
+                    pa.Table.from_pylist(rows), made
+                )
                 write_output(path, made.getvalue())
 
 

@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,14 +12,17 @@ from typer.testing import CliRunner
 
 from carlasc import Boxes
 from carlasc.cli import app
-from carlasc.core.geometry import rotation_z
+from carlasc.core.boxes import mirror_boxes
+from carlasc.core.geometry import invert, mirror_poses, rotation_z
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.metrics import evaluate_boxes
 from carlasc.motion import BoxTable
 from carlasc.storage import FolderSink
+from carlasc.storage.layout import Metadata
 
 pytest.importorskip("scipy")
 
+DATA = Path(__file__).parents[1] / "data"
 SIZE = (4.0, 2.0, 1.5)
 SPEED_M_S = 5.0
 
@@ -36,35 +40,35 @@ def places(frame):
     return {1: (10 + ahead, 3), 2: (10 + ahead, -3), 3: (20 + ahead, 3), 4: (15, 10)}
 
 
+def write_drive(folder, boxes, poses, axes="right"):
+    """Write a drive with a scan per pose, and the boxes, world, of the annotated frames."""
+    writer = FolderSink(folder).sequence("Val/Street/cartesian")
+    for frame, pose in enumerate(poses):
+        writer.write("points", frame, np.zeros((3, 4), np.float32))
+        if frame in boxes:
+            own = boxes[frame].transform(invert(pose))
+            writer.write("boxes", frame, (mirror_boxes(own) if axes == "left" else own).to_table())
+    poses = mirror_poses(poses) if axes == "left" else poses
+    lines = [" ".join(f"{value:.9g}" for value in pose[:3].ravel()) for pose in poses]
+    writer.write_document("poses.txt", "\n".join(lines).encode())
+    writer.write_document("carlasc.json", Metadata(axes=axes).to_json())
+    return folder
+
+
+def boxes_at(middles, size=SIZE):
+    """Boxes along x at (x, y), by number."""
+    world_T_box = np.tile(np.eye(4), (len(middles), 1, 1))
+    world_T_box[:, :2, 3] = np.reshape(list(middles.values()), (-1, 2))
+    numbers, labels = np.array(list(middles), np.uint32), np.full(len(middles), 10, np.uint32)
+    return Boxes.from_poses(numbers, labels, world_T_box, np.tile(size, (len(middles), 1)))
+
+
 @pytest.fixture(scope="module", params=["right", "left"])
 def drive(tmp_path_factory, request):
     """Ten frames with four boxes each; the last frame is not annotated."""
-    from carlasc.core.boxes import mirror_boxes
-    from carlasc.core.geometry import invert, mirror_poses
-    from carlasc.storage.layout import Metadata
-
-    folder = tmp_path_factory.mktemp("drive")
-    writer = FolderSink(folder).sequence("Val/Street/cartesian")
     poses = np.stack([sensor_pose(frame) for frame in range(10)])
-    for frame in range(10):
-        writer.write("points", frame, np.zeros((3, 4), np.float32))
-        if frame == 9:
-            continue
-        world_T_box = np.tile(np.eye(4), (4, 1, 1))
-        world_T_box[:, :2, 3] = list(places(frame).values())
-        boxes = Boxes.from_poses(
-            np.arange(1, 5, dtype=np.uint32),
-            np.full(4, 10, np.uint32),
-            invert(sensor_pose(frame)) @ world_T_box,
-            np.tile(SIZE, (4, 1)),
-        )
-        boxes = mirror_boxes(boxes) if request.param == "left" else boxes
-        writer.write("boxes", frame, boxes.to_table())
-    poses = mirror_poses(poses) if request.param == "left" else poses
-    lines = [" ".join(f"{value:.9g}" for value in pose[:3].ravel()) for pose in poses]
-    writer.write_document("poses.txt", "\n".join(lines).encode())
-    writer.write_document("carlasc.json", Metadata(axes=request.param).to_json())
-    return folder
+    boxes = {frame: boxes_at(places(frame)) for frame in range(9)}
+    return write_drive(tmp_path_factory.mktemp("drive"), boxes, poses, request.param)
 
 
 def table_of(rows):
@@ -122,6 +126,22 @@ def test_scores_by_hand(drive):
     assert most.heading == pytest.approx(10) and most.mota == pytest.approx((9 - 18 - 1) / 27)
 
 
+def test_tracking_scores_are_those_of_trackeval(tmp_path):
+    """TrackEval 1.3.0, `CLEAR`, of the same boxes: missed, false, swapped and renumbered ones."""
+    given = json.loads((DATA / "box_tracks.json").read_text())
+    truth = {}
+    for frame, number, x, y in given["truth"]:
+        truth.setdefault(frame, {})[number] = (x, y)
+    boxes = {frame: boxes_at(middles) for frame, middles in truth.items()}
+    write_drive(tmp_path, boxes, np.tile(np.eye(4), (30, 1, 1)))
+    rows = [(frame, number, x, y, 0.0, sure) for frame, number, x, y, sure in given["found"]]
+    scores = by(evaluate_boxes(table_of(rows), tmp_path))
+    for threshold, expected in given["trackeval"].items():
+        one = scores["all", float(threshold)]
+        found = {name: getattr(one, name) for name in expected}
+        assert found == pytest.approx(expected, abs=1e-12)
+
+
 def test_what_is_out_of_the_region_does_not_count(drive):
     rows = [*perfect((1, 2, 3, 4)), *((f, 9, -30, 0, 0.0, 0.5) for f in range(9))]
     assert by(evaluate_boxes(table_of(rows), drive))["moving", 0.5].precision < 1
@@ -158,3 +178,16 @@ def test_the_command_prints_what_the_function_returns(drive, tmp_path):
     assert made.stdout.startswith("Objects,IoU,Boxes,AP,") and "moving,0.50,27," in made.stdout
     for option in ("--rays", "--all-conventions"):
         assert CliRunner().invoke(app, [*typed, option]).exit_code == 2
+
+
+def test_frames_without_boxes_and_one_annotated_frame(tmp_path):
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    write_drive(tmp_path / "empty", {0: boxes_at({}), 2: boxes_at({})}, poses)
+    scores = by(evaluate_boxes(table_of([(0, 1, 5, 0, 0.0, 1)]), tmp_path / "empty"))
+    assert scores["all", 0.5].precision == 0 and math.isnan(scores["all", 0.5].mota)
+    write_drive(tmp_path / "one", {1: boxes_at({1: (5, 0)})}, poses)
+    scores = by(evaluate_boxes(table_of([(1, 1, 5, 0, 0.0, 1)]), tmp_path / "one"))
+    assert scores["all", 0.5].mota == 1 and scores["moving", 0.5].boxes == 0
+    (tmp_path / "one/Val/Street/cartesian/poses.txt").unlink()
+    with raises(MissingDataError, where="poses.txt"):
+        evaluate_boxes(table_of([(1, 1, 5, 0, 0.0, 1)]), tmp_path / "one")

@@ -45,7 +45,7 @@ CSV = "time,number,class,x,y,z,length,width,height,heading"
     [
         (f"{CSV}\n", "", "no box"),
         (f"{CSV[5:]}\n1,Car,0,0,0,4,2,1,0\n", "", "time absent"),
-        (f"{CSV}\n0,1,Car,0,0,0,4,2,1,0\n0,1,Car,9,0,0,4,2,1,0\n", ": row 2", "another one"),
+        (f"{CSV}\n0,1,Car,0,0,0,4,2,1,0\n0,1,Car,9,0,0,4,2,1,0\n", ": row 2", "[0.0, 1.0, 9.0"),
         (f"{CSV}\n0,1,Car,0,0,0,4,0,1,0\n", ": row 1", "0.0"),
         (f"{CSV}\n0,1,Car,0,0,0,4,nan,1,0\n", ": row 1", "nan"),
         (f"{CSV}\nnan,1,Car,0,0,0,4,2,1,0\n", ": row 1", "nan"),
