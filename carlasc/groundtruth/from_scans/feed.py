@@ -24,7 +24,7 @@ from carlasc.core.arrays import (
     IntArray,
     LabelArray,
 )
-from carlasc.core.geometry import Transform, invert, moved_back, transform_points
+from carlasc.core.geometry import invert, moved_back, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan, check_finite, lengths, sorted_by_origin
 from carlasc.errors import FormatError, MissingDataError
