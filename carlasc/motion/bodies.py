@@ -66,7 +66,8 @@ _STEPS = 640
 _ALIKE_SD = 0.06  # standard deviation of sizes around those of an actor of the data, as a fraction
 # What was seen is smaller than the actor by about this share of it, and larger by so many metres.
 # A share of the actors has parts that were hidden, or points of a neighbour.
-_MISSED, _SMEAR_M, _HIDDEN, _NEIGHBOUR = (0.1, 0.08, 0.1), 0.06, 3e-3, 3e-4
+_MISSED, _SMEAR_M = (0.1, 0.08, 0.1), 0.06
+_HIDDEN, _NEIGHBOUR = 3e-3, (1e-5, 3e-4, 3e-4)
 # An end that was seen is eroded by up to this length; rays miss so much above the ground.
 _ERODED_M, _ABOVE_GROUND_M = 0.1, 0.4
 _LORRY_WIDE_M, _LORRY_HIGH_M, _LORRY_LONG_M = 2.25, 2.3, 6.0  # of shapes
@@ -279,7 +280,7 @@ def _expected(extent: Extent, usual: FloatArray) -> FloatArray:
         missed = np.exp(-np.maximum(more, 0) / (_MISSED[axis] * np.clip(extent.size[axis], 1, 5)))
         missed = _HIDDEN + (1 - _HIDDEN) * missed if known else np.ones(_STEPS + 1)
         smeared = np.exp(-((np.minimum(more, 0) / _SMEAR_M) ** 2) / 2)
-        seen = missed * (_NEIGHBOUR + (1 - _NEIGHBOUR) * smeared)
+        seen = missed * (_NEIGHBOUR[axis] + (1 - _NEIGHBOUR[axis]) * smeared)
         mean, deviation = usual[:, 1 + axis, None], usual[:, 4 + axis, None]
         joint = seen * np.exp(-(((sizes - mean) / deviation) ** 2) / 2) / deviation
         total = joint.sum(axis=1)

@@ -131,7 +131,7 @@ class Track:
         """
         fast = (np.square(self.velocity).sum(axis=1) > MIN_SPEED_M_S**2).any()
         return bool(
-            self.size.max() < LONGEST_M
+            max(self.size.max(), self.extent.size.max()) < LONGEST_M
             and fast
             and np.ptp(self.world_T_actor[:, :3, 3], axis=0).max() > _STATIC_M
         )

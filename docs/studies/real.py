@@ -16,6 +16,7 @@ cannot be measured.
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from functools import reduce
 from operator import add
 from pathlib import Path
@@ -24,12 +25,19 @@ import numpy as np
 import study
 from numpy.typing import NDArray
 from real_drive import find_poses, label_points, read_boxes, read_scans, write_drive
-from real_measures import Judge, Measures
+from real_measures import GROW_M, Judge, Measures, Share
 
 import carlasc
 from carlasc import GridSpec, Run
-from carlasc.groundtruth import FromScans
-from carlasc.motion import MotionOptions
+from carlasc.core import Transform, invert, transform_points
+from carlasc.core.frames import FrameRange
+from carlasc.groundtruth import FromScans, Voting
+from carlasc.groundtruth.from_scans.feed import ScanFeed
+from carlasc.groundtruth.from_scans.frame import merge_frame
+from carlasc.groundtruth.from_scans.merging import BodyRegions
+from carlasc.groundtruth.from_scans.motion_pass import find_actors
+from carlasc.groundtruth.inputs import GridPlan
+from carlasc.motion import BODY_MARGIN_M, MotionOptions
 from carlasc.storage import Sequence
 
 WINDOW = (-30, 30)
@@ -82,6 +90,66 @@ def main() -> None:
         print("\n| labelled object | points | of them moving |\n|---|---:|---:|")
         for track, (moving, points) in found_of(given.archive, found).items():
             print(f"| track {track} | {points} | {moving / points:.1%} |")
+        print("\n| labelled object | BEV IoU | at least 0.5 | voxels | outside of its box |")
+        print("|---|---:|---:|---:|---:|")
+        for line in bodies_of(judge, drives[False], frames):
+            print(line)
+
+
+def bodies_of(judge: Judge, folder: Path, frames: list[int]) -> Iterator[str]:
+    """Yield a row for each labelled mover: how well the body that is found without labels overlaps
+    its box, seen from above, and how many of its voxels are farther than 0.3 m outside of the box.
+    """
+    (drive,) = carlasc.open(folder).sequences().values()
+    feed = ScanFeed(drive, FromScans(window=WINDOW, own_path=False))
+    actors = find_actors(feed)
+    plan = GridPlan(SPEC, "bodies", feed.options, Voting(), FrameRange())
+    windows = {frame: feed.reaching(frame, SPEC) for frame in frames}
+    grids = {
+        frame: merge_frame(plan, feed, actors, frame, near).grid for frame, near in windows.items()
+    }
+    centers = SPEC.centers().reshape(-1, 3)
+    for body in judge.movers:
+        overlaps, own, outside = [], 0, 0
+        for frame, pose in body.poses.items():
+            present = {
+                number: found
+                for number, track in actors.tracks.items()
+                if (found := track.pose(frame)) is not None
+            }
+            number = min(
+                present, key=lambda n: float(np.linalg.norm((present[n] - pose)[:2, 3])), default=-1
+            )
+            if number < 0:
+                overlaps.append(0.0)
+                continue
+            track = actors.tracks[number]
+            sizes = track.size - 2 * BODY_MARGIN_M, body.upper - body.lower
+            overlaps.append(overlap_above(present[number], pose, *sizes))
+            if frame not in grids:
+                continue
+            now = feed.instant(frame)
+            regions = BodyRegions.at(feed.merger(actors, frame), now, windows[frame], SPEC)
+            region = next((r for r, actor in regions.actors.items() if actor == number), -1)
+            chosen = (regions.of_voxel == region) & (grids[frame].labels.reshape(-1) > 0)
+            places = transform_points(now.world_T_grid, centers[chosen])
+            own += len(places)
+            outside += int((~body.contains([frame], places, GROW_M)).sum())
+        good = np.mean(np.array(overlaps) >= 0.5)
+        share = Share(outside, own).percent
+        yield f"| {body.name} | {np.median(overlaps):.2f} | {good:.0%} | {own} | {share:.1f}% |"
+
+
+def overlap_above(
+    one: Transform, other: Transform, size: NDArray[np.float64], size_2: NDArray[np.float64]
+) -> float:
+    """Return the IoU of two boxes seen from above: poses, and sizes in metres; by samples."""
+    steps = (np.arange(60) + 0.5) / 60 - 0.5
+    samples = np.stack(np.meshgrid(steps, steps, [0.0]), axis=-1).reshape(-1, 3) * size
+    inside = np.abs(transform_points(invert(other) @ one, samples)[:, :2]) < size_2[:2] / 2
+    areas = float(np.prod(size[:2])), float(np.prod(size_2[:2]))
+    shared = float(inside.all(axis=1).mean()) * areas[0]
+    return shared / (sum(areas) - shared)
 
 
 def found_of(archive: Path, found: Sequence) -> dict[int, NDArray[np.int64]]:

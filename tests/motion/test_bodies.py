@@ -105,11 +105,11 @@ def test_what_is_known_stays_nearly_as_it_was_seen():
 @pytest.mark.parametrize(
     ("faces", "length", "height", "most"),
     [
-        (REAR, 1.0, 1.5, 0.25),
-        (REAR, 3.9, 1.76, 0.25),
-        ((True, False, True, False), 3.9, 1.76, 0.05),
-        (EVERY_SIDE, 4.4, 1.5, 0.05),
-        (EVERY_SIDE, 7.0, 2.8, 0.06),
+        (REAR, 1.0, 1.5, 0.3),
+        (REAR, 3.9, 1.76, 0.3),
+        ((True, False, True, False), 3.9, 1.76, 0.1),
+        (EVERY_SIDE, 4.4, 1.5, 0.1),
+        (EVERY_SIDE, 7.0, 2.8, 0.1),
     ],
 )
 def test_a_width_that_grows_by_a_centimetre_changes_the_body_a_little(faces, length, height, most):
@@ -168,7 +168,7 @@ def test_a_length_that_no_vehicle_of_this_width_has_is_completed_although_its_si
         (extent((3.9, 1.77, 1.76), (True, False, True, False)), (4.3, 1.85, 1.8)),
         # with points of a neighbour
         (extent((11.0, 3.3, 2.9), EVERY_SIDE, (0.0, -20.0)), (11.8, 2.65, 3.1)),
-        (extent((11.0, 0.4, 2.0), LOW, (0.0, -20.0)), (10.4, 2.4, 2.8)),  # by its length
+        (extent((11.0, 0.4, 2.0), LOW, (0.0, -20.0)), (11.3, 2.5, 3.0)),  # by its length
     ],
 )
 def test_usual_sizes_are_those_of_two_wheelers_cars_and_lorries(seen, size):
