@@ -149,6 +149,14 @@ def evaluate(
             "test.",
         ),
     ] = None,
+    boxes: Annotated[
+        bool,
+        typer.Option(
+            "--boxes",
+            help="SOURCE is a table of boxes, which are scored by those of TRUTH: .csv, .json or "
+            ".parquet, as --boxes-out of label and map writes it.",
+        ),
+    ] = False,
     name: Annotated[
         str | None,
         typer.Option(help="Name of the predictions in the tables. Default: the name of SOURCE."),
@@ -165,6 +173,21 @@ def evaluate(
 
         check_plot(output.plot)  # before anything is counted
     name, common = name or Path(source).name, dict(choice.values)
+    if boxes:
+        others = {
+            **common,
+            **scored.values,
+            "convention": convention,
+            "all_conventions": all_conventions,
+            "forecast": forecast,
+            "compare": compare,
+            "per_frame": output.per_frame,
+            "plot": output.plot,
+        }
+        if refused := [option for option, value in others.items() if value]:
+            raise ArgumentError(refused[0], expected="none with --boxes", found="both")
+        _print_boxes(source, truth, name, region, output)
+        return
     scoring: carlasc.Scoring = scored.make(region=region if region.is_given else None)
     if forecast is not None:
         alone = {
@@ -299,6 +322,22 @@ def _print_forecasts(by_time: Mapping[float, Evaluation], name: str, output: Out
         )
     failures = [failure for result in results for failure in result.failures]
     report_failures(failures, sum(result.frames for result in results) + len(failures))
+
+
+def _print_boxes(
+    source: str, truth: str, name: str, region: RegionFlags, output: OutputFlags
+) -> None:
+    """Score boxes, and print them."""
+    far = math.inf if region.far_m is None else region.far_m
+    result = carlasc.metrics.evaluate_boxes(
+        source, truth, name=name, near_m=region.near_m, far_m=far, fov_rad=math.radians(region.fov)
+    )
+    if output.as_json:
+        print_json(result.to_dict())
+        return
+    _print_tables([result.table()], f"percent, {count(result.frames, 'annotated frame')}", output)
+    if result.left_out:
+        echo(f"note: {result.left_out} boxes at times without an annotated frame", err=True)
 
 
 def _print_conventions(results: Mapping[str, Any], as_json: bool) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated
 
 import typer
@@ -40,6 +41,7 @@ def label(
         ),
     ] = None,
     options: Annotated[Given, Library("carlasc.label")],
+    boxes: Annotated[Given, Library("carlasc.label_motion", "boxes_out")],
     motion: MotionGiven,
     json: Json = False,
 ) -> None:
@@ -58,10 +60,12 @@ def label(
                 found=f"--{name}",
             )
     if predictions == "motion":
+        options = replace(options, name=boxes.name, values={**options.values, **boxes.values})
         _label_motion(source, out, motion, options, run, json)
         return
-    if motion.is_given:
-        raise ArgumentError("motion", expected="--from motion", found=f"--from {predictions}")
+    for name, given in (("motion", motion), ("boxes_out", boxes)):
+        if given.is_given:
+            raise ArgumentError(name, expected="--from motion", found=f"--from {predictions}")
     with run.spread("Labelling", "files") as spread:
         if predictions == "images":
             result = carlasc.label_images(source, out, pixels=pixels, **options.values, run=spread)
@@ -90,7 +94,7 @@ def _label_motion(
     """Write the moving actors as instances and flow, and print their number."""
     observe = carlasc.FromScans(motion=motion.make())
     with run.spread("Finding moving actors", "scans and files") as spread:
-        result = carlasc.label_motion(source, out, observe=observe, **options.values, run=spread)
+        result = options.make(source, out, observe=observe, run=spread)
     if json:
         print_json(result)
         return

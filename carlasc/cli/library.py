@@ -59,6 +59,7 @@ TABLE = {
     "carlasc.convert": Shown(hidden="sequences"),
     "carlasc.evaluate": Shown(hidden="convention name"),
     "carlasc.export": Shown(hidden="sequences"),
+    "carlasc.label_motion": Shown("With --from motion", files="boxes_out"),
     "carlasc.map": Shown(renamed={"cell_m": "--cell"}),
     "carlasc.MapExtras": Shown(files="mesh distance trajectory boxes_out"),
     "carlasc.RecordingOptions": Shown("Recordings", hidden="options", files="keep"),

@@ -44,8 +44,8 @@ class MapExtras:
         distance: with `grid`: .npz file of the distance of each voxel from the surface.
         trajectory: file of the pose of the sensor in the map at each scan, in the format of TUM:
             seconds since the first frame, position, quaternion x, y, z, w.
-        boxes_out: .csv or .json file of the boxes of the moving actors: one row per actor and
-            scan, in the frame of the map.
+        boxes_out: .csv, .json or .parquet file of the boxes of the moving actors: one row per
+            actor and scan, in the frame of the map.
     """
 
     actors: bool = False

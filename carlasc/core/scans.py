@@ -129,9 +129,11 @@ class Scan:
         """Return a scan with the points selected by an (N,) mask or (M,) indices, with all their
         fields. Boxes are kept.
         """
-        others = {name: values[keep] for name, values in self.others.items()}
+        # of rows, `take` is several times faster than an index or a mask
+        rows = np.flatnonzero(keep) if keep.dtype == np.bool_ else keep
+        others = {name: values.take(rows, axis=0) for name, values in self.others.items()}
         own = {
-            name: getattr(self, name)[keep]
+            name: getattr(self, name).take(rows, axis=0)
             for name in ("points", *self.fields())
             if name not in others
         }

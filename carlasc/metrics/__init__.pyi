@@ -1,4 +1,7 @@
 from .actor_scores import ActorScore as ActorScore
+from .box_scores import BoxScore as BoxScore
+from .box_scores import BoxScores as BoxScores
+from .box_scores import evaluate_boxes as evaluate_boxes
 from .casting import cast_rays as cast_rays
 from .casting import rayiou_directions as rayiou_directions
 from .confusion import Completeness as Completeness

@@ -2,6 +2,8 @@ from .bodies import BODY_MARGIN_M as BODY_MARGIN_M
 from .bodies import Extent as Extent
 from .bodies import seen_from as seen_from
 from .bodies import usual_shell as usual_shell
+from .box_table import BOX_ENDINGS as BOX_ENDINGS
+from .box_table import BoxTable as BoxTable
 from .boxes import segment_by_boxes as segment_by_boxes
 from .boxes import tracks_from_boxes as tracks_from_boxes
 from .evidence import HORIZON_S as HORIZON_S

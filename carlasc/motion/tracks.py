@@ -34,7 +34,7 @@ from carlasc.errors import reading
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent, Sizes, measure, surface_of
 from carlasc.motion.paths import Segment, estimate_path, is_static
 from carlasc.motion.segments import MIN_SPEED_M_S
-from carlasc.motion.solving import headings_of, resample
+from carlasc.motion.solving import headings_of, resample, smooth
 from carlasc.storage.arrays import ArrayFormat, open_npz
 from carlasc.storage.files import parse_json
 
@@ -42,6 +42,9 @@ _EXTRAPOLATE_S = 0.5  # a track extends beyond its first and its last segment by
 _STATIC_M = 0.5  # the visible part of a static actor may seem to move this far
 LONGEST_M = 30.0  # no actor is longer or wider: a larger one has points of other things
 _SURE = 0.8  # actors with less confidence are doubtful
+_END = 0.02  # share of the points of a scan beyond each end of what it shows
+_ASIDE = 0.1  # weight of an end that is not turned to the sensor
+_SETTLED_S, _SETTLED_POINTS = 1.5, 200  # positions change over so long; no scan weighs more
 FIRST_FOUND = 1 << 33  # found actors are numbered from here, above all instances
 _FORMATS = {
     "members": ArrayFormat(("<i4",), (None,)),
@@ -168,6 +171,9 @@ def make_track(
             positions, velocities, headings = (
                 np.zeros_like(values) for values in (positions, velocities, headings)
             )
+        elif keeps_shape:
+            positions, _, _ = _fit_box(chain, positions, headings)
+            positions = _settle(chain, positions, headings, seconds)
     else:
         velocities = np.stack(
             [segment.velocity for segment in chain if segment.velocity is not None]
@@ -244,6 +250,39 @@ def _integrate(velocities: FloatArray, seconds: FloatArray, chain: Sequence[Segm
     # centre is nearest to the centre of the body.
     best = int(np.argmax([len(segment.members) for segment in chain]))
     return path - path[best] + chain[best].center
+
+
+def _settle(
+    chain: Sequence[Segment], positions: FloatArray, headings: FloatArray, seconds: FloatArray
+) -> FloatArray:
+    """Return (F, 3) positions at which the visible ends of the actor agree.
+
+    A path that is a little wrong for seconds smears the body. The ends that one scan shows do not
+    depend on the path, and those towards the sensor are seen in most scans.
+    """
+    turns, ends, sensors = [], [], []
+    for segment, position, heading in zip(chain, positions, headings, strict=True):
+        turn = rotation_z(heading)
+        own = rotate_vectors(invert(turn), segment.points - position)[:, :2]
+        turns.append(turn)
+        ends.append(np.quantile(own, (_END, 1 - _END), axis=0))
+        sensors.append(rotate_vectors(invert(turn), segment.origin - position)[:2])
+    counts = np.minimum([len(segment.points) for segment in chain], _SETTLED_POINTS)
+    faces, places = np.array(ends), np.stack(sensors)[:, None]
+    beyond = (np.median(faces, axis=0) - places) * np.array([[1], [-1]])
+    distance = np.maximum(np.linalg.norm(places, axis=2, keepdims=True), 1e-6)
+    weights = _ASIDE + np.clip(beyond / distance, 0, 1)
+    order = np.argsort(faces, axis=0, kind="stable")
+    total = np.cumsum(np.take_along_axis(weights * counts[:, None, None], order, 0), axis=0)
+    middle = (total < total[-1] / 2).sum(axis=0)[None]
+    usual = np.take_along_axis(np.take_along_axis(faces, order, 0), middle, 0)
+    shifts = (weights * (faces - usual)).sum(axis=1) / weights.sum(axis=1)
+    moved, _ = smooth(shifts, seconds, counts.astype(np.float64), _SETTLED_S)
+    moves = (
+        rotate_vectors(turn, np.append(shift, 0.0))
+        for turn, shift in zip(turns, moved, strict=True)
+    )
+    return positions + np.stack(list(moves))
 
 
 def _fit_box(

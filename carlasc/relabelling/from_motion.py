@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
 from carlasc.groundtruth.inputs import GridPlan
 from carlasc.groundtruth.options import FromScans, Voting
+from carlasc.motion.box_table import BoxTable, check_box_file
 from carlasc.motion.ground import ground_points
 from carlasc.motion.tracks import MovingActors, Track
 from carlasc.relabelling.copies import timed, write_in_stages
@@ -55,6 +57,7 @@ def label_motion(
     out: AnyPath,
     *,
     observe: FromScans = FromScans(),  # noqa: B008 (frozen)
+    boxes_out: AnyPath | None = None,
     overwrite: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> MotionResult:
@@ -74,6 +77,8 @@ def label_motion(
         source: the data set with the points: anything that `carlasc.open` takes, or a source.
         out: the folder to write: a path, or a URL of an object store.
         observe: how moving points are found, and where poses come from. `dynamic` is "align".
+        boxes_out: .csv, .json or .parquet file of the boxes of the moving actors of one sequence,
+            which is replaced: one row per actor and scan, in the frame of the poses, right-handed.
         overwrite: replace a data set at `out` that this function has made.
         run: how the work is spread. Steps of progress are scans, then files.
 
@@ -81,7 +86,8 @@ def label_motion(
         The files that were written, and the actors that were found.
 
     Raises:
-        ArgumentError: `observe` does not find actors.
+        ArgumentError: `observe` does not find actors, or `boxes_out` has an unknown ending or is
+            given for several sequences.
         ConflictError: something exists at `out`, or `out` lies inside `source`, or an interrupted
             run had other options.
         MissingDataError: there are no scans, or not the field that `observe` asks for.
@@ -97,6 +103,15 @@ def label_motion(
         )
     share = Share(as_source(source), run)
     given = sequences_with_scans(share)
+    if boxes_out is not None:
+        check_box_file("boxes_out", Path(boxes_out))
+        if len(given) != 1:
+            raise ArgumentError(
+                "boxes_out",
+                expected="one sequence, as a table has one frame",
+                found=f"{len(given)} sequences",
+                advice="give the folder of one",
+            )
     inputs = scan_sequences_of(given, observe)
     copy = DerivedCopy(
         share,
@@ -112,6 +127,8 @@ def label_motion(
         path: str, writer: SequenceWriter | None, pool: Run, step: StepCounter
     ) -> _MovingSequence:
         inputs[path].prepare(writer, pool, step)
+        if boxes_out is not None:
+            _boxes_of(inputs[path]).write(boxes_out)
         return _MovingSequence(given[path], inputs[path].feed, inputs[path].actors)
 
     scans = sum(one.steps_before for one in inputs.values())
@@ -128,6 +145,18 @@ def label_motion(
         **timed(copied, began),
         actors=sum(len(set(one.actors.numbers.values())) for one in moving.values()),
         notes=notes,
+    )
+
+
+def _boxes_of(inputs: ScanSequence) -> BoxTable:
+    """Return the boxes of the moving actors, with their numbers over the whole sequence."""
+    frames, metadata = inputs.sequence.frames("points").tolist(), inputs.metadata
+    return BoxTable.of_tracks(
+        inputs.actors.tracks,
+        dict(zip(frames, inputs.feed.sequence.times_of(frames).tolist(), strict=True)),
+        metadata.classes.names,
+        left=metadata.axes == "left",
+        numbers=inputs.actors.numbers,
     )
 
 

@@ -1,6 +1,6 @@
 """Are maps of drives clean?
 
-`python docs/studies/maps.py [WORK]` prints SA, DA and AA of maps by `carlasc map`, and of other
+`python docs/studies/maps.py [WORK]` prints SA, DA, AA and HA of maps by `carlasc map`, and of other
 programs.
 
 `--draw MAP.npz` draws such a map instead: docs/images/map.png and map_all.png are drives of the
@@ -8,9 +8,9 @@ street with `--motion flow` and `none`.
 
 The measures are those of DynamicMap_Benchmark (Q. Zhang et al., ITSC 2023), by points: SA is the
 share of the static points within 5 cm of a point of the map, DA the share of the dynamic ones
-without such a point, AA the square root of their product. A point is dynamic if its actor moves
-faster than 1 m/s at any time of the drive. Drives are those of `movers.py`: WORK keeps them, and
-results; the default is a temporary folder.
+without such a point, AA the square root of their product, HA their harmonic mean. A point is
+dynamic if its actor moves faster than 1 m/s at any time of the drive. Drives are those of
+`movers.py`: WORK keeps them, and results; the default is a temporary folder.
 
 The rows of other programs need `pip install dufomap dynamic-object-removal` (DUFOMap: Python 3.12
 or older); rows without them are left out. Their settings are those of `makers_rivals.py`: what
@@ -51,9 +51,14 @@ POSES = PoseOptions("file", "never")  # which are exact
 WIDTH, HEIGHT, PIXELS_PER_M = 1200, 560, 15.0
 AZIMUTH, ELEVATION = np.radians(-35), np.radians(38)
 Keep = dict[int, NDArray[np.bool_]]
-# Each program, its maker in makers_rivals.py, and the best of the settings there for maps, by AA on
-# drives apart: `maps.py WORK --town 51 --street 201 --rows all`.
-PROGRAMS = {"DUFOMap": ("dufomap", 4), "dynamic-object-removal": ("removal", 7)}
+# Each program, its maker in makers_rivals.py, settings for maps beside those there, and the best of
+# all, by AA on drives apart: `maps.py WORK --town 51 --street 201 --rows all`.
+_SHORT = {"free_votes_fraction": 0.7, "free_votes_floor": 3, "void_min_scans": 4}
+_FUSION = ({"cleaners": {"fusion": {}}}, {"cleaners": {"fusion": _SHORT}})
+PROGRAMS: dict[str, tuple[str, tuple[Settings, ...], int]] = {
+    "DUFOMap": ("dufomap", (), 4),
+    "dynamic-object-removal": ("removal", _FUSION, 9),
+}
 
 
 @dataclass(frozen=True)
@@ -105,9 +110,9 @@ def by_dynamic_object_removal(
 
 def rivals() -> Iterator[MapRow]:
     """Yield a row of each setting of other programs: the advised one, the best one, and others."""
-    for program, (kind, best) in PROGRAMS.items():
+    for program, (kind, more, best) in PROGRAMS.items():
         (rival,) = [one for one in RIVALS.values() if one.make.__name__ == kind]
-        for place, settings in enumerate(rival.settings):
+        for place, settings in enumerate(rival.settings + more):
             about = {0: "advised", best: "best of a sweep"}.get(place, str(place))
             row = MapRow(f"{program}; {about}", MotionOptions("none"), needs=rival.module or "")
             if kind == "dufomap":
@@ -172,11 +177,14 @@ def measure(row: MapRow, drive: Recorded, dynamic: Keep, folder: Path) -> dict[s
 
 def to_markdown(found: dict[str, list[dict[str, Any]]]) -> str:
     """Return the table: means over drives with their intervals, in percent."""
-    lines = ["| map | SA | DA | AA |", "|---|---:|---:|---:|"]
+    lines = ["| map | SA | DA | AA | HA |", "|---|---:|---:|---:|---:|"]
     for name, drives in found.items():
+        for drive in drives:
+            shares = drive["SA"], drive["DA"]
+            drive["HA"] = 2 * shares[0] * shares[1] / sum(shares)
         cells = (
-            study.interval((100 * drive[key] for drive in drives), ".2f")
-            for key in ("SA", "DA", "AA")
+            study.interval((100 * drive[key] for drive in drives), ".1f")
+            for key in ("SA", "DA", "AA", "HA")
         )
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.errors import raises
 from helpers.scenes.passing_car import SPEED_M_S, scan, sensor_pose, street, write_sequence
 from typer.testing import CliRunner
 
@@ -14,7 +15,7 @@ from carlasc import Boxes, FromScans, Run
 from carlasc.cli import app
 from carlasc.core.geometry import invert, transform_points, translation
 from carlasc.errors import ArgumentError, ConflictError
-from carlasc.motion import MotionOptions
+from carlasc.motion import BoxTable, MotionOptions
 from carlasc.storage import FolderSink, FolderSource
 from carlasc.storage.files import to_json
 
@@ -49,7 +50,10 @@ def numbered(tmp_path_factory):
     folder = tmp_path_factory.mktemp("drive")
     write_sequence(folder / "in", ("labels", "instances"), frames=16)
     observe = FromScans(motion=MotionOptions("instances"))
-    return folder, carlasc.label_motion(folder / "in", folder / "out", observe=observe, run=ONE)
+    out, boxes = folder / "out", folder / "boxes.json"
+    return folder, carlasc.label_motion(
+        folder / "in", out, observe=observe, boxes_out=boxes, run=ONE
+    )
 
 
 def test_points_get_numbers_and_velocities_and_what_stands_keeps_its_number(numbered):
@@ -62,6 +66,35 @@ def test_points_get_numbers_and_velocities_and_what_stands_keeps_its_number(numb
         assert sequence.read("points", frame).tobytes() == before.read("points", frame).tobytes()
     assert sequence.metadata.extra["motion"] == "found by carlasc from instances"
     assert result.actors == 1 and result.linked == 32 and result.files == 32
+
+
+def test_the_boxes_of_actors_are_a_table(numbered):
+    folder, _ = numbered
+    table = BoxTable.read(folder / "boxes.json")
+    assert set(table.numbers.tolist()) == {9} and set(table.classes) == {"Vehicle"}
+    assert np.allclose(table.times, np.arange(16) / 10)
+    for row in (2, 8, 14):
+        points, _, moving = scan(row, sensor_pose(row))
+        first_T_sensor = invert(sensor_pose(0)) @ sensor_pose(row)
+        world = transform_points(first_T_sensor, points[moving])
+        world[:, 1] *= -1 if the_sequence(folder / "in").metadata.axes == "left" else 1
+        half = table.values[row, 3:6] / 2 + 0.1
+        assert (np.abs(world - table.values[row, :3]) < half).all(axis=1).mean() > 0.95
+        assert abs(table.values[row, 6]) < 0.1
+        assert np.abs(table.values[row, 7:10] - [SPEED_M_S, 0, 0]).max() < 1
+
+
+def test_a_table_of_boxes_is_of_one_sequence_and_has_a_known_ending(tmp_path, numbered):
+    folder, _ = numbered
+    with raises(ArgumentError, where="boxes_out", found=str(tmp_path / "a.txt")):
+        carlasc.label_motion(folder / "in", tmp_path / "out", boxes_out=tmp_path / "a.txt", run=ONE)
+    for name in "ab":
+        write_sequence(tmp_path / "two" / name, ("labels",), frames=1)
+    with raises(ArgumentError, where="boxes_out", found="2 sequences"):
+        carlasc.label_motion(
+            tmp_path / "two", tmp_path / "out", boxes_out=tmp_path / "a.csv", run=ONE
+        )
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_exporter_of_kitti_makes_the_classes_that_move_of_it(numbered):

@@ -10,7 +10,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator
 from collections.abc import Sequence as Sequence_
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 from uuid import uuid4
 
@@ -24,7 +24,7 @@ from carlasc.core.arrays import (
     IntArray,
     LabelArray,
 )
-from carlasc.core.geometry import Transform, invert, moved_back, transform_points
+from carlasc.core.geometry import invert, moved_back, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan, check_finite, lengths, sorted_by_origin
 from carlasc.errors import FormatError, MissingDataError
@@ -132,6 +132,7 @@ class ScanFeed:
         max_range_m: farther points are left out, in metres.
         key: the same for all copies of a feed.
         contents: digest of each scan that was compared.
+        pose: returns (4, 4) first_T_sensor of a frame.
     """
 
     def __init__(self, sequence: Sequence, options: FromScans) -> None:
@@ -152,6 +153,7 @@ class ScanFeed:
         self._lock = threading.RLock()  # an executor may be of threads
         self.key = uuid4().hex
         self.contents: dict[int, str] = {}
+        self.pose = cache(sequence.read_pose)
 
     def __reduce__(self) -> tuple[Callable[..., ScanFeed], tuple[Any, ...]]:
         return _restore, (self.key, without_caches(self.sequence), self.options)
@@ -330,10 +332,6 @@ class ScanFeed:
             if driven - last_taken >= limit / _PARTS:
                 last_taken = driven
                 yield int(other)
-
-    def pose(self, frame: int) -> Transform:
-        """Return (4, 4) first_T_sensor."""
-        return self.sequence.read_pose(frame)
 
     def merger(self, actors: MovingActors, frame: int) -> Merger:
         """Return the merger of scans into a frame, with the actors of its window.

@@ -20,6 +20,7 @@ from carlasc.groundtruth.maps.cloud_files import (
     write_octomap,
     write_points,
 )
+from carlasc.motion.box_table import BOX_ENDINGS, check_box_file
 from carlasc.storage.files import AnyPath, write_output
 
 OCTOMAP = ".bt"
@@ -163,6 +164,8 @@ class MapFiles:
         ):
             if needed:
                 import_extra(module, extra)
+        if self.boxes is not None:
+            check_box_file("boxes_out", self.boxes)
 
     def write(self, points: PointPieces, cells: Callable[[], MapCells]) -> None:
         """Write the points, or the tree, and the mesh; `cells` returns the cells of the tree and
@@ -191,7 +194,7 @@ _ENDINGS = {
     "mesh": MESH_ENDINGS,
     "distance": (".npz",),
     "trajectory": (".tum", ".txt"),
-    "boxes_out": (".csv", ".json"),
+    "boxes_out": BOX_ENDINGS,
 }
 _BLOCK = 128  # number of cells along x and y that are meshed at once
 _STEPS = (

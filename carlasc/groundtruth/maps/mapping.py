@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import shutil
 from collections.abc import Iterator
 from contextlib import closing
@@ -35,6 +33,7 @@ from carlasc.groundtruth.maps.growing_cells import (
 from carlasc.groundtruth.maps.map_files import ACTORS, MapCells, MapFiles, write_distances
 from carlasc.groundtruth.options import FromScans, Voting
 from carlasc.motion import HORIZON_S, Track
+from carlasc.motion.box_table import BoxTable
 from carlasc.motion.evidence import views_of
 from carlasc.motion.options import MotionOptions, PoseOptions
 from carlasc.motion.parked import (
@@ -99,9 +98,6 @@ def write_map(
     return MapContent(points, len(drive.frames), bodies, drive.parked, drive.notes())
 
 
-_BOX_COLUMNS = (
-    "time number class x y z length width height heading vx vy vz confidence"  # metres, radians
-).split()
 _BLOCK = 10  # number of scans that a worker sums
 
 
@@ -219,33 +215,14 @@ class DriveMap:
 
     def write_boxes(self, path: Path) -> None:
         """Write the box of each moving actor at each scan, in order of actors, then of time."""
-        rows, names = list[dict[str, Any]](), self.inputs.metadata.classes.names
-        signs = (1, -1, 1) if self.inputs.metadata.axes == "left" else (1, 1, 1)
+        metadata = self.inputs.metadata
         times = self.inputs.feed.sequence.times_of(self.frames).tolist()
-        for number, track in self.inputs.actors.tracks.items():
-            middle = (track.lower + track.upper) / 2
-            for frame, seconds in zip(self.frames, times, strict=True):
-                pose, velocity = track.pose(frame), track.velocity_at(frame)
-                if pose is None or velocity is None:
-                    continue
-                ahead = pose[:3, 0] * signs
-                values = {
-                    **dict(zip("xyz", transform_points(pose, middle) * signs, strict=True)),
-                    **dict(zip(("length", "width", "height"), track.size, strict=True)),
-                    "heading": np.arctan2(ahead[1], ahead[0]),
-                    **dict(zip(("vx", "vy", "vz"), velocity * signs, strict=True)),
-                    "confidence": track.confidence,
-                }
-                row = {"time": round(seconds, 6), "number": number, "class": names[track.label]}
-                rows.append(row | {name: round(float(v), 4) for name, v in values.items()})
-        if path.suffix.lower() == ".json":
-            write_atomic(path, to_json(rows))
-            return
-        text = io.StringIO()
-        table = csv.DictWriter(text, _BOX_COLUMNS, lineterminator="\n")
-        table.writeheader()
-        table.writerows(rows)
-        write_atomic(path, text.getvalue().encode())
+        BoxTable.of_tracks(
+            self.inputs.actors.tracks,
+            dict(zip(self.frames, times, strict=True)),
+            metadata.classes.names,
+            left=metadata.axes == "left",
+        ).write(path)
 
     def write_actors(self, folder: Path, ending: str) -> int:
         """Write the body of each actor, in its own frame, and its poses; return the number of

@@ -1,0 +1,212 @@
+"""One table of the boxes of tracked objects over time, and its files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from carlasc.core.arrays import FloatArray, IntArray
+from carlasc.core.geometry import transform_points
+from carlasc.errors import (
+    ArgumentError,
+    FormatError,
+    MissingDataError,
+    check_types,
+    import_extra,
+    reading,
+)
+from carlasc.motion.tracks import Track
+from carlasc.storage.files import AnyPath, to_json, write_output
+
+BOX_ENDINGS = (".csv", ".json", ".parquet")
+"""Endings of the files of a `BoxTable`."""
+
+_NUMBERS = "x y z length width height heading vx vy vz confidence".split()
+_COLUMNS = ("time", "number", "class", *_NUMBERS)
+_DEFAULTS = {"vx": np.nan, "vy": np.nan, "vz": np.nan, "confidence": 1.0}  # of absent columns
+
+
+@dataclass(frozen=True)
+class BoxTable:
+    """The boxes of tracked objects over time, upright, in one right-handed frame: x ahead, y to the
+    left, z up.
+
+    Attributes:
+        times: (R,) float64 seconds since the first frame.
+        numbers: (R,) int64 number of the object of each box.
+        classes: (R,) names of the classes.
+        values: (R, 11) float64: middle x, y, z, length, width and height, metres; heading, radians,
+            anticlockwise from x; velocity x, y and z, m/s, NaN where not known; confidence, 0 to 1.
+
+    Raises:
+        FormatError: a number is not finite, a size is not positive, or an object has two boxes at
+            one time.
+    """
+
+    times: FloatArray
+    numbers: IntArray
+    classes: tuple[str, ...]
+    values: FloatArray
+
+    def __post_init__(self) -> None:
+        check_types(BoxTable, vars(self))
+        known = np.delete(self.values, [7, 8, 9], axis=1)
+        whole = np.isfinite(np.column_stack([self.times, known])).all(axis=1)
+        first = np.zeros(len(self.times), np.bool_)
+        keys = np.column_stack([self.times, self.numbers])
+        first[np.unique(keys, axis=0, return_index=True)[1]] = True
+        for valid, expected in (
+            (whole, "finite numbers in all columns but those of the velocity"),
+            ((self.values[:, 3:6] > 0).all(axis=1), "a length, width and height above 0 metres"),
+            (first, "one box per number and time"),
+        ):
+            if not valid.all():
+                row = int(valid.argmin())
+                found = f"{[*keys[row].tolist(), *self.values[row].tolist()]}"
+                if valid is first:
+                    found = f"another one of number {keys[row, 1]:.0f} at {keys[row, 0]} s"
+                raise FormatError(
+                    f"row {row + 1}", expected=expected, found=found, advice="remove it, or mend it"
+                )
+
+    @classmethod
+    def of_tracks(
+        cls,
+        tracks: Mapping[int, Track],
+        frames: Mapping[int, float],
+        names: Mapping[int, str],
+        *,
+        left: bool,
+        numbers: Mapping[int, int] | None = None,
+    ) -> Self:
+        """Return the boxes of tracks, in order of the tracks, then of time.
+
+        Args:
+            tracks: the tracks by number.
+            frames: seconds by frame.
+            names: names of the classes.
+            left: whether the axes of the tracks are left-handed.
+            numbers: other numbers of the tracks, by number. Of two boxes of one number in a frame,
+                the one with points is kept.
+        """
+        signs = (1, -1, 1) if left else (1, 1, 1)
+        rows = dict[tuple[int, int], tuple[float, str, FloatArray]]()
+        for number, track in tracks.items():
+            for frame, seconds in frames.items():
+                pose, velocity = track.pose(frame), track.velocity_at(frame)
+                key = (numbers[number] if numbers else number, frame)
+                if pose is None or velocity is None or (key in rows and frame not in track.members):
+                    continue
+                middle = transform_points(pose, (track.lower + track.upper) / 2) * signs
+                ahead, moves = pose[:3, 0] * signs, velocity * signs
+                last = (track.confidence,)
+                own = (middle, track.size, [np.arctan2(ahead[1], ahead[0])], moves, last)
+                rows[key] = (round(seconds, 6), names[track.label], np.concatenate(own).round(4))
+        return cls(
+            np.array([row[0] for row in rows.values()], np.float64),
+            np.array([key[0] for key in rows], np.int64),
+            tuple(row[1] for row in rows.values()),
+            np.array([row[2] for row in rows.values()]).reshape(-1, len(_NUMBERS)),
+        )
+
+    @classmethod
+    def read(cls, path: AnyPath) -> Self:
+        """Read a file that `write` has written, or another one with its columns; those of velocity
+        and confidence may be absent.
+
+        Raises:
+            ArgumentError: the ending is not known.
+            MissingDataError: there is no such file.
+            FormatError: a column is absent, or a value is not valid; see the class.
+            DependencyError: pyarrow is needed and not installed.
+        """
+        path = Path(path)
+        check_box_file("boxes", path)
+        if not path.is_file():
+            raise MissingDataError(path, expected="a table of boxes", found="no file")
+        needed = [name for name in _COLUMNS if name not in _DEFAULTS]
+        with reading(path, f"a table with the columns {', '.join(_COLUMNS)}"):
+            rows = _rows_of(path)
+            absent = [name for name in needed if any(row.get(name) is None for row in rows)]
+        if absent or not rows:
+            found = f"{', '.join(absent)} absent" if rows else "no box"
+            raise FormatError(
+                path,
+                expected=f"boxes with the columns {', '.join(needed)}",
+                found=found,
+                advice="write it with `carlasc label --from motion --boxes-out` or `carlasc map`",
+            )
+        with reading(path, "numbers in all columns but class"):
+            numbers = np.array([int(float(row["number"])) for row in rows], np.int64)
+            times = np.array([float(row["time"]) for row in rows])
+            values = [
+                [float(row.get(name, _DEFAULTS.get(name, np.nan))) for name in _NUMBERS]
+                for row in rows
+            ]
+        try:
+            return cls(times, numbers, tuple(str(row["class"]) for row in rows), np.array(values))
+        except FormatError as error:
+            raise error.within(path) from error
+
+    def write(self, path: AnyPath) -> None:
+        """Write the table; an existing file is replaced.
+
+        Raises:
+            ArgumentError: the ending is not known.
+            DependencyError: pyarrow is needed and not installed.
+            StorageError: the file cannot be written.
+        """
+        path = Path(path)
+        check_box_file("boxes_out", path)
+        columns = (self.times, self.numbers, self.classes, *self.values.T)
+        table = {
+            name: list(column) if name == "class" else np.asarray(column).tolist()
+            for name, column in zip(_COLUMNS, columns, strict=True)
+        }
+        rows = [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
+        text = io.StringIO()
+        match path.suffix.lower():
+            case ".json":
+                write_output(path, to_json(rows))
+            case ".csv":
+                written = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
+                written.writeheader()
+                written.writerows(rows)
+                write_output(path, text.getvalue().encode())
+            case _:
+                made = io.BytesIO()
+                pa = import_extra("pyarrow", "parquet")
+                import_extra("pyarrow.parquet", "parquet").write_table(pa.table(table), made)
+                write_output(path, made.getvalue())
+
+
+def _rows_of(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a file, as they are."""
+    match path.suffix.lower():
+        case ".json":
+            return list(json.loads(path.read_bytes()))
+        case ".csv":
+            with path.open(newline="") as file:
+                return list(csv.DictReader(file))
+    rows: list[dict[str, Any]] = (
+        import_extra("pyarrow.parquet", "parquet").read_table(path).to_pylist()
+    )
+    return rows
+
+
+def check_box_file(argument: str, path: Path) -> None:
+    """Check, before hours of work, the ending of a file of boxes, and that pyarrow is installed if
+    it is needed; `argument` is named in errors.
+    """
+    if path.suffix.lower() not in BOX_ENDINGS:
+        expected = f"a file that ends in {', '.join(BOX_ENDINGS)}"
+        raise ArgumentError(argument, expected=expected, found=str(path))
+    if path.suffix.lower() == ".parquet":
+        import_extra("pyarrow.parquet", "parquet")

@@ -1,0 +1,79 @@
+"""The table of boxes, and its files."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.errors import raises
+from numpy.testing import assert_array_equal
+
+from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.motion import BOX_ENDINGS, BoxTable
+
+ROW = [1.0, -2.0, 0.5, 4.5, 1.8, 1.5, 0.25, 3.0, 0.0, 0.1, 0.75]
+TABLE = BoxTable(
+    np.array([0.0, 0.1, 0.1]),
+    np.array([7, 7, 8]),
+    ("Vehicle", "Vehicle", "a, b"),
+    np.array([ROW, ROW, ROW]) + np.arange(3)[:, None],
+)
+
+
+@pytest.mark.parametrize("ending", BOX_ENDINGS)
+def test_what_is_written_is_read(ending, tmp_path):
+    if ending == ".parquet":
+        pytest.importorskip("pyarrow")
+    TABLE.write(tmp_path / f"boxes{ending}")
+    read = BoxTable.read(tmp_path / f"boxes{ending}")
+    for name, value in vars(TABLE).items():
+        assert_array_equal(getattr(read, name), value)
+
+
+def test_velocity_and_confidence_may_be_absent(tmp_path):
+    names = "time number class x y z length width height heading".split()
+    row = dict(zip(names, [0.5, 3, "Car", 1, 2, 3, 4, 2, 1, 0], strict=True))
+    (tmp_path / "a.json").write_text(json.dumps([row]))
+    assert_array_equal(BoxTable.read(tmp_path / "a.json").values[0, 7:], [np.nan] * 3 + [1])
+
+
+CSV = "time,number,class,x,y,z,length,width,height,heading"
+
+
+@pytest.mark.parametrize(
+    ("text", "where", "found"),
+    [
+        (f"{CSV}\n", "", "no box"),
+        (f"{CSV[5:]}\n1,Car,0,0,0,4,2,1,0\n", "", "time absent"),
+        (f"{CSV}\n0,1,Car,0,0,0,4,2,1,0\n0,1,Car,9,0,0,4,2,1,0\n", ": row 2", "another one"),
+        (f"{CSV}\n0,1,Car,0,0,0,4,0,1,0\n", ": row 1", "0.0"),
+        (f"{CSV}\n0,1,Car,0,0,0,4,nan,1,0\n", ": row 1", "nan"),
+        (f"{CSV}\nnan,1,Car,0,0,0,4,2,1,0\n", ": row 1", "nan"),
+        (f"{CSV}\n0,1,Car,0,0,zero,4,2,1,0\n", "", "zero"),
+        (f"{CSV}\n0,1,Car,0,0,0,4,2\n", "", "height, heading absent"),
+    ],
+)
+def test_bad_tables_are_named(text, where, found, tmp_path):
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(FormatError) as error:
+        BoxTable.read(tmp_path / "a.csv")
+    assert error.value.where == f"{tmp_path / 'a.csv'}{where}"
+    assert found in error.value.found and "\n" not in str(error.value)
+
+
+def test_files_that_are_no_tables_are_named(tmp_path):
+    for name, content in (
+        ("a.json", b"{"),
+        ("b.json", b"[1]"),
+        ("c.json", b"3"),
+        ("d.csv", b"\xff"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with raises(FormatError, where=str(tmp_path / name)):
+            BoxTable.read(tmp_path / name)
+    with raises(MissingDataError, where=str(tmp_path / "e.csv")):
+        BoxTable.read(tmp_path / "e.csv")
+    with raises(ArgumentError, where="boxes", found=str(tmp_path / "e.txt")):
+        BoxTable.read(tmp_path / "e.txt")
+    with raises(FormatError, where="row 1"):
+        replace(TABLE, values=np.zeros_like(TABLE.values))
