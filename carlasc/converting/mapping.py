@@ -86,6 +86,7 @@ class MapResult:
         points: number of points, or of occupied voxels.
         frames: number of scans; 1 for a grid.
         actors: number of actors whose bodies were written.
+        parked: number of parked actors that were left out, as they are gone in another pass.
         failures: scans of a recording that could not be read, and are not in the map.
         notes: remarks on the results, one line each.
         findings: what is probably wrong with a recording.
@@ -96,6 +97,7 @@ class MapResult:
     points: int
     frames: int
     actors: int
+    parked: int
     failures: tuple[Failure, ...]
     notes: tuple[str, ...]
     findings: tuple[Finding, ...]
@@ -113,6 +115,7 @@ def map(
     recording: RecordingOptions = RecordingOptions(),
     motion: MotionOptions = MotionOptions(),  # noqa: B008 (frozen)
     poses: PoseOptions = PoseOptions(),  # noqa: B008 (frozen)
+    keep_parked: bool = False,
     overwrite: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> MapResult:
@@ -142,6 +145,7 @@ def map(
         motion: how moving points are found.
         poses: where poses come from. Missing poses are estimated from the scans, unless
             `PoseOptions("file")` is given.
+        keep_parked: keep vehicles that stand there in one pass of a place and not in another one.
         overwrite: replace existing files.
         run: how the work is spread. Steps of progress are scans.
 
@@ -187,7 +191,7 @@ def map(
         of_places = source_states(root, recordings, options)
         states = {name: state for of in of_places.values() for name, state in of.items()}
     first, settings = files.all[0], (cell_m, str(wanted), grid, [str(path) for path in files.all])
-    record = MadeFrom(combined(settings, motion, poses, sorted(states.items())))
+    record = MadeFrom(combined(settings, motion, poses, keep_parked, sorted(states.items())))
     keeper, kept = FolderWriter(first.parent), f"map-{first.name}"
     is_ours, place = MadeFrom.read(keeper, kept) == record, first.parent / layout.DERIVED
     place /= f"recording-{first.name}"
@@ -217,7 +221,7 @@ def map(
         drive, poses = as_source(made.sequences[0]), replace(poses, source="file")
     if grid is None:
         spread = replace(run, progress=steps.stage())
-        content = write_map(drive, files, wanted, cell_m, motion, poses, spread)
+        content = write_map(drive, files, wanted, cell_m, motion, poses, keep_parked, spread)
     else:
         content = write_grid(drive, grid, wanted, files)
     record.write(keeper, kept)
@@ -230,6 +234,7 @@ def map(
         content.points,
         content.frames,
         content.actors,
+        content.parked,
         made.failures if made else (),
         notes,
         made.findings if made else (),

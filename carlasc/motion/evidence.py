@@ -164,15 +164,14 @@ class _Kept:
     seconds: float
     views: tuple[SortedReturns, ...]
 
-    @classmethod
-    def of(cls, scan: EvidenceScan, seconds: float) -> _Kept:
-        """Sort the points of each sensor of a scan by their directions."""
-        if scan.origins is None:
-            return cls(scan, seconds, (SortedReturns.of(scan.points),))
-        views = (
-            SortedReturns.of(scan.points[own], scan.origins[own]) for own in _sensors(scan.origins)
-        )
-        return cls(scan, seconds, tuple(views))
+
+def views_of(scan: EvidenceScan) -> tuple[SortedReturns, ...]:
+    """Sort the points of each sensor of a scan by their directions."""
+    if scan.origins is None:
+        return (SortedReturns.of(scan.points),)
+    return tuple(
+        SortedReturns.of(scan.points[own], scan.origins[own]) for own in _sensors(scan.origins)
+    )
 
 
 def find_evidence(
@@ -211,7 +210,7 @@ def find_evidence(
         last = seconds
         # Invariant: `window` holds the scans within the horizon of the current one, which is the
         # first whose evidence is not given yet. It is complete when a scan lies beyond its horizon.
-        window.append(_Kept.of(scan, seconds))
+        window.append(_Kept(scan, seconds, views_of(scan)))
         while window[-1].seconds - window[current].seconds > HORIZON_S:
             yield from found(current)
             current += 1

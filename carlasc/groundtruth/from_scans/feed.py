@@ -426,16 +426,23 @@ class ScanFeed:
         explained = np.zeros(len(scan), np.bool_)
         for segment in self._segments(frame, scan, boxes):
             explained[segment.members] = True
-        ground = (
-            np.isin(_labels(scan), sorted(self.classes.ground))
-            if self.trusts_ground_labels or self.must_find_ground
-            else None
-        )
         labels = _labels(scan) if self.has_labels else None
         origins, times = scan.others.get("origins"), scan.others.get("seconds")
-        return EvidenceScan(
-            frame, scan.points, pose, self.time(frame), ground, labels, explained, origins, times
-        )
+        about = self.known_ground(scan), labels, explained, origins, times
+        return EvidenceScan(frame, scan.points, pose, self.time(frame), *about)
+
+    def known_ground(self, scan: Scan | PreparedScan) -> BoolArray | None:
+        """Return (N,) bool: the points of a scan whose labels are of ground; None if labels do not
+        tell.
+        """
+        if scan.labels is None or not (self.trusts_ground_labels or self.must_find_ground):
+            return None
+        return np.isin(scan.labels, sorted(self.classes.ground))
+
+    def ground(self, scan: PreparedScan) -> BoolArray:
+        """Return (N,) bool: the points of a scan on the ground."""
+        known = self.known_ground(scan)
+        return ground_points(scan.points) if known is None else known
 
     def segments(self, frame: int, boxes: Sequence_[Track]) -> ScanMotion:
         """Return the actors of a scan that the fields of the sequence show.

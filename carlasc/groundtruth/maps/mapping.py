@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple, Self, TypeVar
 
@@ -15,7 +16,7 @@ from carlasc.core.arrays import AnyArray, FloatArray, IntArray
 from carlasc.core.frames import FrameRange
 from carlasc.core.geometry import invert, mirror_poses, quaternions_of, transform_points
 from carlasc.core.grids import GridSpec, mirror_voxels
-from carlasc.errors import ArgumentError, MissingDataError
+from carlasc.errors import ArgumentError, MissingDataError, count
 from carlasc.groundtruth.from_scans.feed import ScanFeed, WithoutScans
 from carlasc.groundtruth.from_scans.merging import Merger
 from carlasc.groundtruth.from_scans.sequences import ScanSequence, scan_sequences
@@ -33,7 +34,17 @@ from carlasc.groundtruth.maps.map_files import ACTORS, MapCells, MapFiles, write
 from carlasc.groundtruth.options import FromScans, Voting
 from carlasc.motion import HORIZON_S, Track
 from carlasc.motion.box_table import BoxTable
+from carlasc.motion.evidence import views_of
 from carlasc.motion.options import MotionOptions, PoseOptions
+from carlasc.motion.parked import (
+    Compared,
+    View,
+    compare_passes,
+    find_gone,
+    keys_of,
+    other_passes,
+    summed,
+)
 from carlasc.motion.tracks import MovingActors
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run, StepCounter
@@ -49,12 +60,14 @@ class MapContent(NamedTuple):
         points: number of points, or of occupied voxels.
         frames: number of scans; 1 for a grid.
         actors: number of actors whose bodies were written.
+        parked: number of parked actors that were left out, as they are gone in another pass.
         notes: remarks on the results, one line each.
     """
 
     points: int
     frames: int
     actors: int
+    parked: int
     notes: tuple[str, ...]
 
 
@@ -65,6 +78,7 @@ def write_map(
     cell_m: float,
     motion: MotionOptions,
     poses: PoseOptions,
+    keep_parked: bool,
     run: Run,
 ) -> MapContent:
     """Write the map of the one drive of a source. For the arguments and errors, see
@@ -73,7 +87,7 @@ def write_map(
     options = FromScans(window=(0, 0), motion=motion, poses=poses)
     with temporary_folder(files.all[0]) as folder:  # of cells that do not fit into memory
         drive = DriveMap.of(source, frames, options, GrowingCells(folder, cell_m))
-        drive.fill(run, files.actors is not None)
+        drive.fill(run, files.actors is not None, keep_parked)
         points, bodies = drive.write(files), 0
         if files.trajectory is not None:
             drive.write_trajectory(files.trajectory)
@@ -81,7 +95,7 @@ def write_map(
             drive.write_boxes(files.boxes)
         if files.actors is not None and files.out is not None:
             bodies = drive.write_actors(files.actors, files.out.suffix.lower())
-    return MapContent(points, len(drive.frames), bodies, drive.notes())
+    return MapContent(points, len(drive.frames), bodies, drive.parked, drive.notes())
 
 
 _BLOCK = 10  # number of scans that a worker sums
@@ -95,11 +109,13 @@ class DriveMap:
         inputs: the scans, their poses, and the moving actors.
         frames: the frames whose scans are in the map.
         cells: the map.
+        parked: number of parked actors that were left out, as they are gone in another pass.
     """
 
     inputs: ScanSequence
     frames: list[int]
     cells: GrowingCells
+    parked: int = 0
 
     @classmethod
     def of(
@@ -120,27 +136,46 @@ class DriveMap:
         view = WithoutScans(sequence, hidden) if hidden else sequence
         return cls(ScanSequence(view, plan, options), chosen, cells)
 
-    def fill(self, run: Run, actors: bool) -> None:
-        """Refine poses, find moving actors, and add the static points of each scan; with `actors`,
-        add the points of actors too.
+    def fill(self, run: Run, actors: bool, keep_parked: bool = False) -> None:
+        """Refine poses, find moving actors and, unless they are kept, parked ones that leave, and
+        add the static points of each scan; with `actors`, add the points of actors too.
         """
         inputs = self.inputs
         progress = StepCounter(run.progress, inputs.steps_before + len(self.frames))
         progress(0)
         with one_pool(run) as pool:
             inputs.prepare(None, pool, progress)
-            blocks = [
-                tuple(self.frames[first : first + _BLOCK])
-                for first in range(0, len(self.frames), _BLOCK)
-            ]
+            gone = np.empty(0, np.int64)
+            if inputs.feed.motion and not keep_parked:
+                gone, self.parked = self._find_gone(pool, progress)
+            blocks = _blocks(self.frames)
             items = ((block, inputs.actors.between(block[0], block[-1])) for block in blocks)
             with closing(
-                run_all(_AddScans(inputs.feed, self.cells.cell_m, actors), items, pool)
+                run_all(_AddScans(inputs.feed, self.cells.cell_m, actors, gone), items, pool)
             ) as added:
                 for block, pieces in zip(blocks, added, strict=True):
                     self.cells.add(pieces)
                     progress(len(block))
         self.cells.finish()
+
+    def _find_gone(self, pool: Run, progress: StepCounter) -> tuple[IntArray, int]:
+        """Return the cells of parked actors that are gone in another pass, and their number."""
+        feed, frames = self.inputs.feed, np.array(self.frames)
+        positions = np.stack([feed.pose(frame)[:3, 3] for frame in self.frames])
+        seconds = np.array([feed.time(frame) for frame in self.frames])
+        passes = {
+            self.frames[row]: [frames[rows].tolist() for rows in others]
+            for row, others in other_passes(positions, seconds).items()
+        }
+        blocks, near = _blocks(list(passes)), self.inputs.actors.between
+        progress.expect(len(passes))
+        items = (({one: passes[one] for one in own}, near(own[0], own[-1])) for own in blocks)
+        found = np.empty(0, np.int64), np.empty((0, 3), np.int32)
+        with closing(run_all(partial(_compare_passes, feed=feed), items, pool)) as compared:
+            for block, new in zip(blocks, compared, strict=True):
+                found = summed([found, new])
+                progress(len(block))
+        return find_gone(*found)
 
     def write(self, files: MapFiles) -> int:
         """Write the map, and return the number of its points.
@@ -163,9 +198,9 @@ class DriveMap:
         return MapCells(cells_of(whole, self.cells.cell_m), whole["label"], np.zeros(3), size)
 
     def _pieces(self, group: int, about: str) -> PointPieces:
-        count = sum(number for part, number in self.cells.counts.items() if part[0] == group)
+        points = sum(number for part, number in self.cells.counts.items() if part[0] == group)
         return PointPieces(
-            count, lambda: self.cells.points(group), self.inputs.metadata.classes, about
+            points, lambda: self.cells.points(group), self.inputs.metadata.classes, about
         )
 
     def write_trajectory(self, path: Path) -> None:
@@ -234,16 +269,45 @@ class DriveMap:
             )
         elif metadata.predicted:
             notes.append(f"{where}: classes are those of labels that were {metadata.predicted}")
+        if self.parked:
+            notes.append(
+                f"{where}: {count(self.parked, 'parked actor')} that stood there in one pass and "
+                "not in another one: left out (`keep_parked=True` keeps such)"
+            )
         return tuple(notes)
+
+
+def _blocks(frames: list[int]) -> list[tuple[int, ...]]:
+    return [tuple(frames[first : first + _BLOCK]) for first in range(0, len(frames), _BLOCK)]
+
+
+def _compare_passes(
+    block: tuple[dict[int, list[list[int]]], MovingActors], feed: ScanFeed
+) -> Compared:
+    """Compare the scans of a block with other passes of their places, in a worker."""
+    passes, actors = block
+    merger = Merger(feed.read, actors, feed.classes, "align")
+
+    @cache
+    def view(frame: int) -> View:
+        return feed.pose(frame), views_of(feed.evidence_scan(frame, ()))
+
+    found = []
+    for frame, others in passes.items():
+        scan, views = feed.read(frame), [[view(other) for other in one] for one in others]
+        compared = merger.static(frame) & ~feed.ground(scan)
+        found.append(compare_passes(scan.points, compared, scan.world_T_sensor, views))
+    return summed(found)
 
 
 @dataclass(frozen=True)
 class _AddScans:
-    """Sums the scans of a block, in a worker."""
+    """Sums the scans of a block, in a worker; without the cells, in order, of what is gone."""
 
     feed: ScanFeed
     cell_m: float
     actors: bool
+    gone: IntArray
 
     def __call__(self, block: tuple[tuple[int, ...], MovingActors]) -> list[tuple[Part, AnyArray]]:
         frames, actors = block
@@ -261,6 +325,9 @@ class _AddScans:
         if feed.must_find_ground:  # ground that was found had a class for the votes only
             labels[np.isin(labels, sorted(feed.classes.ground))] = feed.classes.geometry_id
         world = transform_points(scan.world_T_sensor, scan.points.astype(np.float64))
+        if len(self.gone):
+            inside = np.isin(keys_of(world), self.gone)
+            static = static & ~(inside & ~feed.ground(scan)) if inside.any() else static
         settled = merger.settled(frame).points if self.actors else scan.points
         chosen: list[tuple[int, AnyArray, FloatArray]] = [
             (STATIC, np.flatnonzero(static), world[static])
@@ -320,7 +387,7 @@ def write_grid(source: Source, name: str, frames: FrameRange, files: MapFiles) -
     files.write(pieces, lambda: MapCells(index, labels, lower, size))
     if files.distance is not None:
         write_distances(files.distance, given)
-    return MapContent(len(points), 1, 0, ())
+    return MapContent(len(points), 1, 0, 0, ())
 
 
 def with_neighbours(frames: FrameRange) -> FrameRange:
