@@ -2,15 +2,14 @@
 
 A scan sees only the faces of an actor that are turned to the sensor. All observations of a track
 together show some of its faces: of a car ahead, only the rear. Length and width are known if the
-visible faces show them. The rest is expected from usual vehicles and actors of the same data, all
-weighted by how well they fit what was seen; the body extends from the visible face away from the
-sensor.
+visible faces show them. Otherwise they are taken from similar actors of the same data, or from a
+table, and the body extends from the visible face away from the sensor.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,19 +22,21 @@ _FACE_POINTS, _FACE_SHARE = (
     0.02,
 )
 _FACE_SINE = 0.26  # a scan sees a face if its rays meet the face at 15 degrees or more
-_ALIKE = 0.15  # the shapes of actors are similar if their sizes differ by this fraction
-# no vehicle is shorter, or narrower, than these shares of what is expected of it
+_ALIKE = 0.15  # actors are similar if their known sizes differ by this fraction
+# no vehicle is shorter, or narrower, than these shares of the usual size of its kind
 _SHORTEST = (
     0.6,
     0.85,
 )
-_EXAMPLES = 3  # a shape is learned from at most so many actors
+_HIGHER = 1.6  # the height may grow by less than this factor
+_EXAMPLES = 3  # a size is learned from at least so many actors, and a shape from at most so many
 # cells of surfaces, and cells in which surfaces of several actors are compared
 _CELL_M, _BIN_M = (
     0.1,
     0.2,
 )
-_ACTORS_WIDE_M = 1.3  # narrower vehicles have two wheels
+_ACTORS_WIDE_M, _ACTORS_LONG_M = 1.3, 2.6  # narrower or shorter vehicles have two wheels
+_WIDEST_M = 2.4, 2.8  # of cars, and of longer vehicles: wider ones have points of a neighbour
 _LOWEST_M = 1.0  # of lower ones, only a part was seen
 
 BODY_MARGIN_M = 0.1  # margin of the box of an actor around its body
@@ -47,30 +48,9 @@ _INSET_M = (
 _BELT, _CABIN, _CABIN_WIDE = 0.62, (0.08, 0.75), 0.85
 
 LENGTH, WIDTH = 0, 1
-# Vehicles: share of all, mean length, width and height, metres, and their standard deviations:
-# two-wheelers, small cars, cars, vans, large vans, lorries, buses and long vehicles.
-_USUAL = np.array(
-    [
-        (0.2, 1.8, 0.72, 1.7, 0.12, 0.08, 0.15),
-        (0.15, 3.8, 1.7, 1.5, 0.25, 0.06, 0.1),
-        (0.35, 4.4, 1.82, 1.5, 0.3, 0.06, 0.1),
-        (0.15, 4.8, 1.92, 1.85, 0.4, 0.08, 0.15),
-        (0.07, 5.6, 2.05, 2.4, 0.5, 0.1, 0.25),
-        (0.05, 7.5, 2.4, 3.0, 1.2, 0.12, 0.35),
-        (0.03, 11.5, 2.55, 3.2, 1.0, 0.1, 0.25),
-        (0.02, 16.0, 2.6, 3.5, 6.0, 0.2, 0.4),
-    ]
-)
-_LARGEST_M = 32.0, 4.0, 5.6  # sizes from 0 to these are possible, in so many steps
-_STEPS = 640
-_ALIKE_SD = 0.06  # standard deviation of sizes around those of an actor of the data, as a fraction
-# What was seen is smaller than the actor by about this share of it, and larger by so many metres.
-# A share of the actors has parts that were hidden, or points of a neighbour.
-_MISSED, _SMEAR_M = (0.1, 0.08, 0.1), 0.06
-_HIDDEN, _NEIGHBOUR = 3e-3, (1e-5, 3e-4, 3e-4)
-# An end that was seen is eroded by up to this length; rays miss so much above the ground.
-_ERODED_M, _ABOVE_GROUND_M = 0.1, 0.4
-_LORRY_WIDE_M, _LORRY_HIGH_M, _LORRY_LONG_M = 2.25, 2.3, 6.0  # of shapes
+# Length and width, metres, of vehicles with two wheels, cars, vans, and lorries and buses.
+_TWO_WHEELS, _CAR, _VAN, _LORRY = (1.8, 0.7), (4.4, 1.85), (5.4, 2.0), (7.5, 2.5)
+_LORRY_WIDE_M, _LORRY_HIGH_M, _LORRY_LONG_M, _LORRY_TOP_M, _VAN_HIGH_M = 2.25, 2.3, 6.0, 2.8, 1.95
 
 
 @dataclass(frozen=True)
@@ -111,7 +91,10 @@ class Extent:
         """Whether length and width are large enough for a vehicle of this width or length, and this
         height; smaller ones are of a part of it.
         """
-        length, width = (self.size[:2] > _SHORTEST * _expected(self, _USUAL)[:2]).tolist()
+        length, width = (
+            bool(self.size[axis] > share * _table(self, axis))
+            for axis, share in enumerate(_SHORTEST)
+        )
         return length, width
 
     @property
@@ -175,39 +158,67 @@ class Sizes:
         self._shapes = {label: list[tuple[Extent, Float32Array]]() for label, _, _ in examples}
         for label, shapes in self._shapes.items():
             own = [(e, surface) for other, e, surface in examples if other == label]
-            known = np.array([e.size for e, _ in own if all(e.known + e.plausible)]).reshape(-1, 3)
-            alike = np.column_stack([np.ones(len(known)), known, _ALIKE_SD * known])
-            self._known[label] = np.concatenate([_USUAL, alike])
+            self._known[label] = np.array(
+                [e.size for e, _ in own if all(e.known + e.plausible)]
+            ).reshape(-1, 3)
             shapes += [(e, surface) for e, surface in own if e.exemplary and len(surface)]
 
     def complete(self, label: int, extent: Extent) -> tuple[FloatArray, FloatArray]:
-        """Return the corners of the whole body: the mean of its size over the usual sizes and those
-        of actors of the same class, given what was seen.
+        """Return the corners of the whole body: unknown lengths and widths are taken from similar
+        actors.
+
+        A body is never smaller than its visible part, unless that is wider than any vehicle.
 
         Returns:
             (3,) lower and (3,) upper corner, metres, actor frame.
         """
+        extent = _without_neighbours(extent)
         lower, upper = extent.lower.copy(), extent.upper.copy()
-        if not any(extent.known):  # too few points, or too far away
+        known, plausible = extent.known, extent.plausible
+        if not any(known):  # too few points, or too far away
             return lower, upper
-        usual = self._known.get(label, _USUAL)
-        others = (usual[:, 1:4] != extent.size).any(axis=1)  # an actor is no example of itself
-        size = _expected(extent, usual[others])
-        missing = size - extent.size
         for axis in (LENGTH, WIDTH):
+            if known[axis] and plausible[axis]:
+                continue
+            missing = max(self._expected(label, extent, axis) - (upper[axis] - lower[axis]), 0.0)
             # What is missing is behind the actor, as the sensor sees it: the near end was seen.
-            eroded = float(np.clip(missing[axis] / 2, 0, _ERODED_M))
             if extent.seen_from[axis] < 0:
-                lower[axis] -= eroded
-                upper[axis] = lower[axis] + size[axis]
+                upper[axis] += missing
             else:
-                upper[axis] += eroded
-                lower[axis] = upper[axis] - size[axis]
-        # Other things may hide the wheels, or the lowest ray may pass above them; the top of a
-        # lorry may be above the highest ray.
-        lower[2] -= np.clip(missing[2], 0, _ABOVE_GROUND_M)
-        upper[2] = lower[2] + size[2]
+                lower[axis] -= missing
+        # other things may hide the wheels, or the lowest ray may pass above them
+        if not extent.exemplary:
+            lower[2] -= max(self._height(label, upper - lower) - (upper[2] - lower[2]), 0.0)
+        # the top of a lorry may be above the highest ray
+        if upper[LENGTH] - lower[LENGTH] > _LORRY_LONG_M:
+            upper[2] = max(upper[2], lower[2] + _LORRY_TOP_M)
         return lower, upper
+
+    def _expected(self, label: int, extent: Extent, axis: int) -> float:
+        """Return the length or the width of actors like `extent` in the other size, and in the
+        height if some are.
+        """
+        other = 1 - axis
+        sizes = self._known.get(label, np.empty((0, 3)))
+        far = (sizes - extent.size) / np.maximum(extent.size, _CELL_M)
+        alike, as_high = np.abs(far[:, other]) < _ALIKE, far[:, 2] > -_ALIKE
+        # Cars and vans are alike in one size, so the height decides between them, if there are
+        # enough of the same height; the visible height is a lower limit in any case.
+        for chosen in (sizes[alike & as_high & (far[:, 2] < _ALIKE)], sizes[alike & as_high]):
+            if len(chosen) >= _EXAMPLES:
+                return float(np.median(chosen[:, axis]))
+        return _table(extent, axis)
+
+    def _height(self, label: int, size: FloatArray) -> float:
+        """Return the height of actors that are as long and as wide as `size`, (3,) metres; without
+        such actors, its own height.
+        """
+        sizes = self._known.get(label, np.empty((0, 3)))
+        alike = sizes[
+            (np.abs(sizes - size) < _ALIKE * size)[:, :2].all(axis=1)
+            & (sizes[:, 2] < _HIGHER * size[2])
+        ]
+        return float(np.median(alike[:, 2])) if len(alike) >= _EXAMPLES else float(size[2])
 
     def surface(
         self, label: int, lower: FloatArray, upper: FloatArray, extent: Extent
@@ -264,30 +275,30 @@ def surface_of(points: FloatArray) -> Float32Array:
     return (cells[count > 1] * _CELL_M).astype(np.float32)
 
 
-def _expected(extent: Extent, usual: FloatArray) -> FloatArray:
-    """Return the mean (3,) length, width and height of an actor, given what was seen of it.
-
-    It is continuous: nearly equal observations have nearly equal sizes.
-
-    Args:
-        extent: what was seen.
-        usual: (K, 7) shares, means and standard deviations, as in `_USUAL`.
+def _without_neighbours(extent: Extent) -> Extent:
+    """Return the extent, cut to the greatest width of a vehicle of its length; the side towards the
+    sensor stays.
     """
-    weights, means = np.log(usual[:, 0]), np.empty((len(usual), 3))
-    for axis, known in enumerate((*extent.known, True)):
-        sizes = np.linspace(0, _LARGEST_M[axis], _STEPS + 1)
-        more = sizes - float(extent.size[axis])
-        missed = np.exp(-np.maximum(more, 0) / (_MISSED[axis] * np.clip(extent.size[axis], 1, 5)))
-        missed = _HIDDEN + (1 - _HIDDEN) * missed if known else np.ones(_STEPS + 1)
-        smeared = np.exp(-((np.minimum(more, 0) / _SMEAR_M) ** 2) / 2)
-        seen = missed * (_NEIGHBOUR[axis] + (1 - _NEIGHBOUR[axis]) * smeared)
-        mean, deviation = usual[:, 1 + axis, None], usual[:, 4 + axis, None]
-        joint = seen * np.exp(-(((sizes - mean) / deviation) ** 2) / 2) / deviation
-        total = joint.sum(axis=1)
-        weights = weights + np.log(total)
-        means[:, axis] = (joint * sizes).sum(axis=1) / total
-    share = np.exp(weights - weights.max())
-    return np.asarray((share[:, None] * means).sum(axis=0) / share.sum())
+    length, wide, height = extent.size.tolist()
+    if wide <= _WIDEST_M[length > _LORRY_LONG_M or not extent.known[LENGTH]]:
+        return extent
+    width = (_LORRY if length > _LORRY_LONG_M or height > _LORRY_HIGH_M else _CAR)[WIDTH]
+    lower, upper = extent.lower.copy(), extent.upper.copy()
+    if extent.seen_from[WIDTH] < 0:
+        upper[WIDTH] = lower[WIDTH] + width
+    else:
+        lower[WIDTH] = upper[WIDTH] - width
+    return replace(extent, lower=lower, upper=upper)
+
+
+def _table(extent: Extent, axis: int) -> float:
+    """Return the usual length or width of an actor whose other size is known."""
+    length, width, height = extent.size.tolist()
+    if width > _LORRY_WIDE_M if axis == LENGTH else length > _LORRY_LONG_M:
+        return _LORRY[axis]
+    if width > _ACTORS_WIDE_M if axis == LENGTH else length > _ACTORS_LONG_M:
+        return (_VAN if height > _VAN_HIGH_M else _CAR)[axis]
+    return _TWO_WHEELS[axis]
 
 
 def usual_shell(lower: FloatArray, upper: FloatArray, extent: Extent) -> Float32Array:

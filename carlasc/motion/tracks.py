@@ -44,6 +44,7 @@ LONGEST_M = 30.0  # no actor is longer or wider: a larger one has points of othe
 _SURE = 0.8  # actors with less confidence are doubtful
 _END = 0.02  # share of the points of a scan beyond each end of what it shows
 _ASIDE = 0.1  # weight of an end that is not turned to the sensor
+_AGREE_M = 0.5  # an end that is farther from its usual place is that of a part of the actor
 _SETTLED_S, _SETTLED_POINTS = 1.5, 200  # positions change over so long; no scan weighs more
 FIRST_FOUND = 1 << 33  # found actors are numbered from here, above all instances
 _FORMATS = {
@@ -258,7 +259,8 @@ def _settle(
     """Return (F, 3) positions at which the visible ends of the actor agree.
 
     A path that is a little wrong for seconds smears the body. The ends that one scan shows do not
-    depend on the path, and those towards the sensor are seen in most scans.
+    depend on the path, and those towards the sensor are seen in most scans. Where a scan shows a
+    part of the actor only, its ends are elsewhere, and do not count.
     """
     turns, ends, sensors = [], [], []
     for segment, position, heading in zip(chain, positions, headings, strict=True):
@@ -276,7 +278,9 @@ def _settle(
     total = np.cumsum(np.take_along_axis(weights * counts[:, None, None], order, 0), axis=0)
     middle = (total < total[-1] / 2).sum(axis=0)[None]
     usual = np.take_along_axis(np.take_along_axis(faces, order, 0), middle, 0)
-    shifts = (weights * (faces - usual)).sum(axis=1) / weights.sum(axis=1)
+    agree = np.abs(faces - usual) < _AGREE_M
+    weights = weights * agree + 1e-9  # no scan is without weight
+    shifts = (weights * agree * (faces - usual)).sum(axis=1) / weights.sum(axis=1)
     moved, _ = smooth(shifts, seconds, counts.astype(np.float64), _SETTLED_S)
     moves = (
         rotate_vectors(turn, np.append(shift, 0.0))
