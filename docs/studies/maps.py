@@ -54,7 +54,7 @@ Keep = dict[int, NDArray[np.bool_]]
 # Each program, its maker in makers_rivals.py, settings for maps beside those there, and the best of
 # all, by AA on drives apart: `maps.py WORK --town 51 --street 201 --rows all`.
 _SHORT = {"free_votes_fraction": 0.7, "free_votes_floor": 3, "void_min_scans": 4}
-_FUSION = ({"cleaners": {"fusion": {}}}, {"cleaners": {"fusion": _SHORT}})
+_FUSION: tuple[Settings, ...] = ({"cleaners": {"fusion": {}}}, {"cleaners": {"fusion": _SHORT}})
 PROGRAMS: dict[str, tuple[str, tuple[Settings, ...], int]] = {
     "DUFOMap": ("dufomap", (), 4),
     "dynamic-object-removal": ("removal", _FUSION, 9),
