@@ -298,7 +298,9 @@ def _trace(
     # cell need no exact rule therefore, unlike those of the kernel.
     _, slots, unused, left, counts, stamps = blocks
     views, sign, stamp = len(stamps) > 0, change[0], change[1]
-    block_x, block_y, block_z = begin[0], begin[1], begin[2]
+    # unsigned: Numba need not look for negative indices
+    block_x, block_y, block_z = np.uint64(begin[0]), np.uint64(begin[1]), np.uint64(begin[2])
+    bits = np.uint64(_BITS)
     rays, labels = empty_rays(BLOCK), np.ones(BLOCK, np.uint16)
     top_x, top_y, top_z = region.size[0] - 1.0, region.size[1] - 1.0, region.size[2] - 1.0
     for place in range(len(ends)):
@@ -316,23 +318,23 @@ def _trace(
                     return ray + i
                 while step <= last:
                     # clipped, as rounding may put samples beyond the region
-                    cell_x = int(min(max(x - step * dx, 0.0), top_x))
-                    cell_y = int(min(max(y - step * dy, 0.0), top_y))
-                    cell_z = int(min(max(z - step * dz, 0.0), top_z))
+                    cell_x = np.uint64(min(max(x - step * dx, 0.0), top_x))
+                    cell_y = np.uint64(min(max(y - step * dy, 0.0), top_y))
+                    cell_z = np.uint64(min(max(z - step * dz, 0.0), top_z))
                     step += 1.0
-                    a = (cell_x >> _BITS) + block_x
-                    b = (cell_y >> _BITS) + block_y
-                    c = (cell_z >> _BITS) + block_z
+                    a = (cell_x >> bits) + block_x
+                    b = (cell_y >> bits) + block_y
+                    c = (cell_z >> bits) + block_z
                     slot = slots[a, b, c]
                     if slot < 0:
                         left[0] -= 1
                         slot = slots[a, b, c] = unused[left[0]]
-                    cell = _in_block(cell_x, cell_y, cell_z)
+                    block, cell = np.uint64(slot), _in_block(cell_x, cell_y, cell_z)
                     if views:
-                        if stamps[slot, cell] == stamp:
+                        if stamps[block, cell] == stamp:
                             continue
-                        stamps[slot, cell] = stamp
-                    counts[slot, cell] = counts[slot, cell] + sign if sign else stamp
+                        stamps[block, cell] = stamp
+                    counts[block, cell] = counts[block, cell] + sign if sign else stamp
             ray += count
     return ray
 
@@ -340,8 +342,8 @@ def _trace(
 @inlined
 def _in_block(x: int, y: int, z: int) -> int:
     """Return the index of a cell in its block."""
-    last = _EDGE - 1
-    return ((((x & last) << _BITS) + (y & last)) << _BITS) + (z & last)
+    last, bits = np.uint64(_EDGE - 1), np.uint64(_BITS)
+    return ((((x & last) << bits) + (y & last)) << bits) + (z & last)
 
 
 @inlined
@@ -357,7 +359,7 @@ def _add_column(
     least: int,
     slots: Int32Array,
     counts: Int32Array,
-    column: IntArray,
+    column: Int32Array,
 ) -> None:
     """Add the counts of the cells at `start + k * stride`, in cells from the first one, to
     `column[k]`, if they are at least `least`.
@@ -373,14 +375,16 @@ def _add_column(
         number = int(more) + 1
         a, b, end = i >> _BITS, j >> _BITS, min(low + number, end_z << _BITS)
         if 0 <= a < end_x and 0 <= b < end_y:
-            cell = _in_block(i, j, 0)
+            cell = _in_block(np.uint64(i), np.uint64(j), np.uint64(0))
             begin = max(low, 0)
             while begin < end:
                 slot, above = slots[a, b, begin >> _BITS], min((begin | (_EDGE - 1)) + 1, end)
                 if slot >= 0:
-                    for other in range(begin, above):
-                        value = counts[slot, cell + (other & (_EDGE - 1))]
-                        column[k + other - low] += value if value >= least else 0
+                    first, into = cell + np.uint64(begin & (_EDGE - 1)), np.uint64(k + begin - low)
+                    block = np.uint64(slot)
+                    for other in range(np.uint64(above - begin)):
+                        value = counts[block, first + other]
+                        column[into + other] += value if value >= least else 0
                 begin = above
         k += number
 
@@ -410,7 +414,7 @@ def _gather(
     """
     across, along, up = parts
     size, voxel_size, first = cells.size, cells.voxel_size, blocks.first
-    columns, row = np.empty(size[2] * up, np.int64), 0
+    columns, row = np.empty(size[2] * up, np.int32), 0
     rise = voxel_size[2] / up
     stride = pose[2] * rise, pose[6] * rise, pose[10] * rise
     while row < len(found):
@@ -440,7 +444,9 @@ def _gather(
                 start = x - (first[0] << _BITS), y - (first[1] << _BITS), z - (first[2] << _BITS)
                 _add_column(start, stride, least, blocks.slots, blocks.counts, column)
         for k in range(height):
-            total = column[k * up : (k + 1) * up].sum()
+            total = 0
+            for part in range(k * up, (k + 1) * up):
+                total += column[part]
             # rays passed through the voxel: it does not become unknown by rounding
             found[row + k] = max(round(total * weight), 1) if total > 0 else 0
         row += height
