@@ -16,7 +16,14 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from carlasc.core.arrays import Float32Array, FloatArray, Int32Array, IntArray, Uint32Array
+from carlasc.core.arrays import (
+    AnyArray,
+    Float32Array,
+    FloatArray,
+    Int32Array,
+    IntArray,
+    Uint32Array,
+)
 from carlasc.core.cells import Cells, Pose, Triple, as_pose, pose_of, transform
 from carlasc.core.compiling import cached, inlined, jit
 from carlasc.core.geometry import Transform, invert
@@ -28,10 +35,12 @@ from carlasc.groundtruth.voting.rays import DROPPED, clip, empty_rays, view_from
 
 _BITS = 3  # a block has 2 ** _BITS cells along each edge
 _EDGE = 1 << _BITS
+_CELLS = _EDGE**3  # of a block
 # About the height of a cell, as most rays graze the ground, and its width in the map of an actor.
 # With wider ones, pedestrians lose: see docs/studies/rays.md.
 _CELL_M = 0.05
 _MOST = 8  # greatest number of cells along an edge of a voxel, as in those of 0.4 m; least: 2
+_MANY = 4096  # samples that are found before their cells change: they fit into the L1 cache
 _FEWEST = 256  # least number of blocks by which a map grows
 Counted = Literal["samples", "scans", "last"]
 """What cells count: samples, or scans; or they keep the last scan, which takes no removal."""
@@ -115,8 +124,8 @@ class _Blocks(NamedTuple):
         slots: (X, Y, Z) index of each block in `counts`; -1 without one.
         unused: (U,) indices; the first ones are of blocks that are not in use.
         left: (1,) how many of them there are.
-        counts: (B, cells) samples or scans in each cell, or the last scan.
-        stamps: (B, cells) the last scan that was added or removed, if scans are counted.
+        counts: (B * cells,) samples or scans in each cell, or the last scan.
+        stamps: (B * cells,) the last scan that was added or removed, if scans are counted.
     """
 
     first: IntArray
@@ -156,7 +165,7 @@ class FreeMap:
     def _clear(self) -> None:
         self._held.clear()
         slots, unused = np.empty((0, 0, 0), np.int32), np.empty(0, np.int32)
-        counts, stamps = (np.empty((0, _EDGE**3), np.int32) for _ in range(2))
+        counts, stamps = (np.empty(0, np.int32) for _ in range(2))
         origin, left = np.zeros(3, np.int64), np.zeros(1, np.int64)
         self._blocks = _Blocks(origin, slots, unused, left, counts, stamps)
 
@@ -220,10 +229,10 @@ class FreeMap:
 
     def _grow(self) -> None:
         """Make room for more blocks."""
-        old, size = self._blocks, len(self._blocks.counts)
+        old, size = self._blocks, len(self._blocks.counts) // _CELLS
         more = max(size // 4, _FEWEST)
         for cells in (old.counts, old.stamps) if self._counted == "scans" else (old.counts,):
-            cells.resize((size + more, _EDGE**3), refcheck=False)  # without a copy
+            cells.resize((size + more) * _CELLS, refcheck=False)  # without a copy
         # the lowest ones are taken first, from the end: memory that was used before
         unused = np.concatenate([np.arange(size + more - 1, size - 1, -1), old.unused])
         old.left[0] += more
@@ -241,7 +250,7 @@ class FreeMap:
         high = np.maximum(np.minimum(last, old.first + old.slots.shape), low)
         kept = old.slots[tuple(map(slice, low - old.first, high - old.first))]
         slots[tuple(map(slice, low - first, high - first))] = kept
-        is_unused = np.ones(len(old.counts), np.bool_)
+        is_unused = np.ones(len(old.counts) // _CELLS, np.bool_)
         is_unused[kept[kept >= 0]] = False
         unused = np.flatnonzero(is_unused)[::-1].astype(np.int32)
         left = np.array([len(unused)])
@@ -297,10 +306,9 @@ def _trace(
     # the same cells change, and their counts return to what they were. Samples near the edge of a
     # cell need no exact rule therefore, unlike those of the kernel.
     _, slots, unused, left, counts, stamps = blocks
-    views, sign, stamp = len(stamps) > 0, change[0], change[1]
     # unsigned: Numba need not look for negative indices
     block_x, block_y, block_z = np.uint64(begin[0]), np.uint64(begin[1]), np.uint64(begin[2])
-    bits = np.uint64(_BITS)
+    bits, places, used = np.uint64(_BITS), np.empty(_MANY, np.uint64), 0
     rays, labels = empty_rays(BLOCK), np.ones(BLOCK, np.uint16)
     top_x, top_y, top_z = region.size[0] - 1.0, region.size[1] - 1.0, region.size[2] - 1.0
     for place in range(len(ends)):
@@ -315,6 +323,7 @@ def _trace(
                     continue
                 # Each sample may need a block. A ray is added whole, so that it can begin again.
                 if left[0] <= last - step:
+                    _change(places[:used], change, counts, stamps)
                     return ray + i
                 while step <= last:
                     # clipped, as rounding may put samples beyond the region
@@ -329,14 +338,35 @@ def _trace(
                     if slot < 0:
                         left[0] -= 1
                         slot = slots[a, b, c] = unused[left[0]]
-                    block, cell = np.uint64(slot), _in_block(cell_x, cell_y, cell_z)
-                    if views:
-                        if stamps[block, cell] == stamp:
-                            continue
-                        stamps[block, cell] = stamp
-                    counts[block, cell] = counts[block, cell] + sign if sign else stamp
+                    if used == _MANY:
+                        _change(places, change, counts, stamps)
+                        used = 0
+                    places[used] = np.uint64(slot * _CELLS) + _in_block(cell_x, cell_y, cell_z)
+                    used += 1
             ray += count
+    _change(places[:used], change, counts, stamps)
     return ray
+
+
+@jit
+def _change(
+    places: AnyArray, change: tuple[int, int], counts: Int32Array, stamps: Int32Array
+) -> None:
+    """Change the cells of samples."""
+    # A loop of its own: the processor waits for many cells at once, as they are far from each other
+    # in memory.
+    sign, stamp = change
+    if len(stamps):
+        for place in places:
+            if stamps[place] != stamp:
+                stamps[place] = stamp
+                counts[place] += sign
+    elif sign:
+        for place in places:
+            counts[place] += sign
+    else:
+        for place in places:
+            counts[place] = stamp
 
 
 @inlined
@@ -381,9 +411,9 @@ def _add_column(
                 slot, above = slots[a, b, begin >> _BITS], min((begin | (_EDGE - 1)) + 1, end)
                 if slot >= 0:
                     first, into = cell + np.uint64(begin & (_EDGE - 1)), np.uint64(k + begin - low)
-                    block = np.uint64(slot)
+                    first += np.uint64(slot * _CELLS)
                     for other in range(np.uint64(above - begin)):
-                        value = counts[block, first + other]
+                        value = counts[first + other]
                         column[into + other] += value if value >= least else 0
                 begin = above
         k += number
