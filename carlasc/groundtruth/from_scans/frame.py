@@ -21,14 +21,14 @@ from carlasc.core.arrays import (
     LabelArray,
     Uint8Array,
 )
-from carlasc.core.cells import count_points, joined
+from carlasc.core.cells import as_pose, count_points, joined
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.groundtruth.from_scans.actor_voxels import find_voxels
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import STATIC, BodyRegions, Instant, Merger
 from carlasc.groundtruth.inputs import FrameData, GridPlan
-from carlasc.groundtruth.voting.ballot import Ballot, Observation, SeenClass, Votes
+from carlasc.groundtruth.voting.ballot import Ballot, ClassPoints, Observation, SeenClass, Votes
 from carlasc.groundtruth.voting.certainty import (
     UNKNOWN,
     ClassConsensus,
@@ -451,10 +451,11 @@ class _FrameSteps:
         """Return the voxels outside of bodies that moving points are in at other times."""
         if self.feed.options.dynamic != "align":
             return _NO_VOXELS
-        moving = [np.empty((0, 3), np.float32), *map(self.merger.moving, self.others)]
-        ends = np.cumsum([len(points) for points in moving])[1:]
-        passing = count_points(np.concatenate(moving), self.grid_T_others, self.plan.spec, ends)
-        return np.flatnonzero((passing > 0) & ~self.in_body)
+        voters = [
+            ClassPoints(np.ascontiguousarray(self.merger.moving(frame).T), as_pose(pose))
+            for frame, pose in zip(self.others, self.grid_T_others, strict=True)
+        ]
+        return np.flatnonzero(self.vote([SeenClass(1, voters)]).hit & ~self.in_body)
 
     def keep_returns(self, made: _UnfinishedGrid, votes: Votes, consensus: ClassConsensus) -> None:
         """Make voxels with returns of the frame's own scan occupied, unless the returns are
