@@ -24,7 +24,7 @@ from carlasc.core.arrays import (
     IntArray,
     Uint32Array,
 )
-from carlasc.core.cells import Cells, Pose, Triple, as_pose, pose_of, transform
+from carlasc.core.cells import Cells, Pose, Real, Triple, as_pose, pose_of, transform
 from carlasc.core.compiling import cached, inlined, jit
 from carlasc.core.geometry import Transform, invert
 from carlasc.core.grids import GridSpec
@@ -370,7 +370,7 @@ def _change(
 
 
 @inlined
-def _in_block(x: int, y: int, z: int) -> int:
+def _in_block(x: Real, y: Real, z: Real) -> Real:
     """Return the index of a cell in its block."""
     last, bits = np.uint64(_EDGE - 1), np.uint64(_BITS)
     return ((((x & last) << bits) + (y & last)) << bits) + (z & last)

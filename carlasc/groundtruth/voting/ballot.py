@@ -270,9 +270,9 @@ class Ballot:
         from carlasc.groundtruth.voting import kernel
 
         counted = np.zeros(self.spec.num_voxels + 1, kernel.HIT_DTYPE)
-        hit = np.empty(len(counted), np.int32)
         for label, voters, regions, region in seen:
-            number = 0
+            points, number = sum(one.points.shape[1] for one in voters), 0
+            hit = np.empty(min(points, len(counted)), np.int32)
             certain = all(one.sure is None for one in voters)
             doubt = np.zeros(0 if certain else len(counted), np.float32)
             for voter, (place, pose, sure) in enumerate(voters, 1):
