@@ -12,6 +12,7 @@ See the format page, `docs/format.md#cells`.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -242,7 +243,7 @@ def numbered(cells: IntArray) -> tuple[IntArray, IntArray]:
 
 def count_points(
     points: AnyFloatArray,
-    grid_T_points: FloatArray,
+    grid_T_points: Collection[Transform],
     spec: GridSpec,
 ) -> Int32Array:
     """Return the number of points per voxel, (V,), which are in several places.
@@ -251,10 +252,11 @@ def count_points(
 
     Args:
         points: (N, 3) metres.
-        grid_T_points: (K, 4, 4), from the frame of the points to that of the grid, for each place.
+        grid_T_points: (4, 4), from the frame of the points to that of the grid, for each place.
         spec: geometry of the grid.
     """
-    counts, poses = np.zeros(spec.num_voxels, np.int32), grid_T_points[:, :3].reshape(-1, 12)
+    counts = np.zeros(spec.num_voxels, np.int32)
+    poses = np.array([*map(as_pose, grid_T_points)]).reshape(-1, 12)
     _count(np.ascontiguousarray(points), poses, Cells.of(spec), counts)
     return counts
 

@@ -15,7 +15,6 @@ from carlasc.core.arrays import (
     AnyIntArray,
     BoolArray,
     Float32Array,
-    FloatArray,
     Int32Array,
     IntArray,
     LabelArray,
@@ -23,6 +22,7 @@ from carlasc.core.arrays import (
 )
 from carlasc.core.cells import as_pose, count_points, joined
 from carlasc.core.classes import ClassTable
+from carlasc.core.geometry import Transform
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.groundtruth.from_scans.actor_voxels import find_voxels
 from carlasc.groundtruth.from_scans.feed import ScanFeed
@@ -176,18 +176,14 @@ def _join_shares(
     return joined[np.argsort(joined["voxel"], kind="stable")]
 
 
-def _have_neighbours(voxels: IntArray, others: IntArray, spec: GridSpec) -> BoolArray:
-    """Return which of (N,) voxels, flat indices, have one of (M,) other voxels, increasing, among
-    the 26 around them.
+def _are_alone(voxels: IntArray, others: IntArray, spec: GridSpec) -> BoolArray:
+    """Return which of (N,) voxels, flat indices, have none of (M,) other voxels among the 26 around
+    them; they are among the others themselves.
     """
-    around = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    near = (
-        np.stack(np.unravel_index(voxels, spec.size), axis=-1)[:, None]
-        + around[np.any(around != 0, axis=1)]
-    )
-    inside = ((near >= 0) & (near < spec.size)).all(axis=2)
-    flat = np.ravel_multi_index(tuple(np.moveaxis(near, 2, 0)), spec.size, mode="clip")
-    return (np.isin(flat, others) & inside).any(axis=1)
+    taken = np.zeros(np.add(spec.size, 2), np.bool_)
+    taken[1:-1, 1:-1, 1:-1].flat[others] = True
+    around = sliding_window_view(taken, (3, 3, 3))
+    return around[np.unravel_index(voxels, spec.size)].sum(axis=(1, 2, 3)) == 1
 
 
 def find_above(solid: BoolArray, known: BoolArray, bodies: BoolArray, spec: GridSpec) -> IntArray:
@@ -305,15 +301,10 @@ class _FrameSteps:
         return self.regions.of_voxel != STATIC
 
     @cached_property
-    def others(self) -> list[int]:
-        """The other frames of the window."""
-        return [frame for frame in self.window if frame != self.now.frame]
-
-    @cached_property
-    def grid_T_others(self) -> FloatArray:
-        """(K, 4, 4) poses of the sensor at the other frames."""
-        poses = [self.now.grid_T_world @ self.feed.pose(frame) for frame in self.others]
-        return np.array(poses).reshape(-1, 4, 4)
+    def grid_T_sensor(self) -> dict[int, Transform]:
+        """(4, 4) pose of the sensor at each other frame of the window."""
+        others = [frame for frame in self.window if frame != self.now.frame]
+        return {frame: self.now.grid_T_world @ self.feed.pose(frame) for frame in others}
 
     @cached_property
     def returned(self) -> tuple[IntArray, Int32Array]:
@@ -324,8 +315,8 @@ class _FrameSteps:
 
     def _returned(self, chosen: BoolArray | slice) -> tuple[IntArray, Int32Array]:
         points, now = self.merger.settled(self.now.frame).points[chosen], self.now
-        grid_T_sensor = now.grid_T_world @ self.feed.pose(now.frame)
-        counts = count_points(points, grid_T_sensor[None], self.plan.spec)
+        pose = now.grid_T_world @ self.feed.pose(now.frame)
+        counts = count_points(points, [pose], self.plan.spec)
         voxels = np.flatnonzero(counts)
         return voxels, counts[voxels]
 
@@ -453,7 +444,7 @@ class _FrameSteps:
             return _NO_VOXELS
         voters = [
             ClassPoints(np.ascontiguousarray(self.merger.moving(frame).T), as_pose(pose))
-            for frame, pose in zip(self.others, self.grid_T_others, strict=True)
+            for frame, pose in self.grid_T_sensor.items()
         ]
         return np.flatnonzero(self.vote([SeenClass(1, voters)]).hit & ~self.in_body)
 
@@ -470,7 +461,7 @@ class _FrameSteps:
             returned, returns = self._returned(self.merger.static(self.now.frame))
         is_lost = (made.labels[returned] == 0) & (consensus.labels[returned] > 0)
         lost = returned[is_lost]
-        is_single = (returns[is_lost] == 1) & ~_have_neighbours(lost, returned, self.plan.spec)
+        is_single = (returns[is_lost] == 1) & _are_alone(lost, returned, self.plan.spec)
         rows = votes.occupied[np.isin(votes.occupied["voxel"], lost)]
         hits = np.bincount(np.searchsorted(lost, rows["voxel"]), rows["votes"], len(lost))
         free = votes.free.reshape(-1)[lost]
@@ -499,7 +490,7 @@ class _FrameSteps:
         apart = float(self.plan.spec.voxel_size[[0, 2]].min()) / 2
         axes = [np.arange(a, b + 1e-9, apart) for a, b in zip(_OWN_LOWER, _OWN_UPPER, strict=True)]
         body = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
-        path = count_points(body, self.grid_T_others, self.plan.spec)
+        path = count_points(body, self.grid_T_sensor.values(), self.plan.spec)
         voxels = np.flatnonzero((path > 0) & (made.labels > 0))
         solid = ~self.feed.classes.have_role(made.labels[voxels], "ground")
         is_there_now = self.in_body[voxels] | np.isin(voxels, self.returned[0])

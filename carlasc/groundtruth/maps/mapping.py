@@ -323,7 +323,7 @@ class _AddScans:
         feed, scan = self.feed, self.feed.read(frame)
         labels, static = merger.labels(frame), merger.static(frame)
         if feed.must_find_ground:  # ground that was found had a class for the votes only
-            labels[np.isin(labels, sorted(feed.classes.ground))] = feed.classes.geometry_id
+            labels[feed.classes.have_role(labels, "ground")] = feed.classes.geometry_id
         world = transform_points(scan.world_T_sensor, scan.points.astype(np.float64))
         if len(self.gone):
             inside = np.isin(keys_of(world), self.gone)

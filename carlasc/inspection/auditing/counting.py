@@ -398,8 +398,8 @@ class FrameCounter:
             for a, b in zip(lower, upper, strict=True)
         ]
         lattice = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
-        grid_T_actor = np.stack([grid_T_world @ pose for pose in poses])
-        return np.flatnonzero(count_points(lattice, grid_T_actor, spec))
+        placed = [grid_T_world @ pose for pose in poses]
+        return np.flatnonzero(count_points(lattice, placed, spec))
 
 
 def _are_returns(scan: Scan) -> BoolArray:
