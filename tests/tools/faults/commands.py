@@ -180,6 +180,7 @@ EVERY = (
     Command("label-images", "label seen -o out --from images", ("seen",), "out", _PICTURES),
     Command("refine", "refine scene -o out --refine always", ("scene",), "out"),
     Command("map", "map scene out.ply", ("scene",), "out.ply"),
+    Command("map-actors", "map scene out.ply --actors --mesh out.glb", ("scene",), "out_actors"),
     Command("map-bag", "map bag out.ply --force", ("bag",), "out.ply", ("rosbags",)),
     Command(
         "map-grid", "map scene out.ply --grid evaluation_16x16x8 --frames 1", ("scene",), "out.ply"
