@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from carlasc.core.arrays import BoolArray, FloatArray, IntArray
-from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
+from carlasc.core.geometry import Transform, invert, multiply, rotation_z, thin, transform_points
 from carlasc.motion.evidence import (
     OWN_CELL_M,
     OWN_CELLS,
@@ -35,6 +35,9 @@ _MIN_OBSERVATIONS, _MIN_PATH_M, _MIN_SPEED_M_S = 5, 1.0, 0.5  # an actor needs s
 _STRAIGHT = 0.35  # least extent of a path over its length: noise moves back and forth
 _MAX_JUMP_M_S = 4.0  # greatest median deviation of the observations' steps from the path's
 _PARTS_M = 1.0  # parts of one vehicle are closer to each other
+_BESIDE_RAD = 0.012  # and no wider gap is between their directions
+# So high things that are not longer are a rider or a person, and no part of something else.
+_WHOLE_M = (1.1, 2.2, 2.4)
 _PERSON_M = (1.5, 2.3)  # actors that are narrower and lower change their shape as they move
 _SHIFT_M = (
     0.5  # observations are shifted along their path by so much, to test whether they still align
@@ -50,6 +53,9 @@ _LINE_SLOPE = 0.004  # a quarter of a degree: the points of one scan line differ
 # cannot be told from a person who walks beside the sensor at exactly its pace.
 _ALWAYS, _FREED, _OFTEN = 0.95, 0.3, 0.3
 _BESIDE_M = 1.8  # farther beside the way of the sensor, another vehicle may drive along
+# What stands on the ground beside the sensor is a rider or a person, who keeps its pace: so near
+# above the ground, and so high and not longer.
+_FOOT_M, _STANDS_M, _STRETCH_M = 0.6, 1.0, 2.6
 _OWN_SHARE = 0.5  # an actor with so many points in these cells is none
 _SAMPLES = 300  # points of an observation that its path is estimated from
 
@@ -103,6 +109,7 @@ class ActorFollower:
         self._near, self._freed = np.zeros((2, OWN_CELLS**3), np.int64)
         self._cells: dict[int, list[IntArray]] = {}
         self._poses: list[Transform] = []
+        self._grounds: list[float] = []
         self._close: list[tuple[int, IntArray, IntArray]] = []
         self._deformable, self._label, self._number = deformable, default_label, first_instance
         self._alive: list[_ActorChain] = []
@@ -113,6 +120,8 @@ class ActorFollower:
         """
         self.moved[scan.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
         self._poses.append(scan.world_T_sensor)
+        if np.isfinite(scan.ground_m):
+            self._grounds.append(scan.ground_m)
         self._near[scan.near] += 1
         sensor_T_world = invert(scan.world_T_sensor)
         for members, points in zip(scan.clusters, scan.points, strict=True):
@@ -163,7 +172,26 @@ class ActorFollower:
         own &= (across_m < _BESIDE_M)[..., None]
         while (more := _widened(own) & ~own & (freed >= _OFTEN * scans)).any():
             own |= more
-        return own
+        left, parts = own.copy(), own
+        while left.any():
+            part = np.zeros_like(own)
+            part.flat[left.argmax()] = True
+            while (more := _widened(part) & left & ~part).any():
+                part |= more
+            left &= ~part
+            if self._stands(np.argwhere(part)):
+                parts = parts & ~part
+        return parts
+
+    def _stands(self, cells: IntArray) -> bool:
+        """Return whether (K, 3) cells that touch are of a rider or a person beside the sensor."""
+        if not self._grounds:
+            return False
+        lower, upper = (cells.min(axis=0), cells.max(axis=0) + 1)
+        size = (upper - lower) * OWN_CELL_M
+        foot = float((lower[2] - OWN_CELLS // 2) * OWN_CELL_M) - float(np.median(self._grounds))
+        stands = foot < _FOOT_M and size[2] > _STANDS_M
+        return bool(stands and np.hypot(size[0], size[1]) < _STRETCH_M)
 
     def _actors(self, chains: list[_ActorChain]) -> list[FoundActor]:
         actors = []
@@ -208,6 +236,13 @@ class _Link:
     def is_small(self) -> bool:
         """Whether it is not larger than a person."""
         return _is_small(self.upper - self.lower)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it has the size of a rider or a person."""
+        length, width, height = self.upper - self.lower
+        low, high, long = _WHOLE_M
+        return bool(low < height < high and np.hypot(length, width) < long)
 
     def joined(self, other: _Link) -> _Link:
         """Return the two as one observation."""
@@ -415,13 +450,19 @@ def _join_parts(links: list[_Link], deformable: Collection[int]) -> list[_Link]:
 
 
 def _are_parts(one: _Link, other: _Link, deformable: Collection[int]) -> bool:
-    label = one.segment.label
-    if label != other.segment.label:
+    label, whole = one.segment.label, one.is_whole and other.is_whole
+    if label != other.segment.label or whole:
         return False
     if label in deformable or (not (label and deformable) and one.is_small and other.is_small):
         return False
     samples = [thin(link.segment.points, _SAMPLES) for link in (one, other)]
-    return bool(nearest_points(*samples)[1].min() < _PARTS_M**2)
+    # No ray passes between two parts of one side, however far apart it meets them.
+    ahead = samples[0][0] - one.segment.origin
+    directions = rotation_z(-float(np.arctan2(ahead[1], ahead[0])))[:2, :2]
+    seen = [multiply(points[:, :2] - one.segment.origin[:2], directions.T) for points in samples]
+    angles = [np.arctan2(y, x) for x, y in (places.T for places in seen)]
+    gap = max(a.min() - b.max() for a, b in (angles, angles[::-1]))
+    return bool(gap < _BESIDE_RAD and nearest_points(*samples)[1].min() < _PARTS_M**2)
 
 
 def _link(
