@@ -51,6 +51,7 @@ _IN_A_ROW = 4  # the same, if all scans on one side in time, from the farthest i
 # Every third scan is looked up first. A place that so many scans saw occupied, and none saw free,
 # is static.
 _EVERY, _SURE = 3, 4
+_MIXED = 2  # a static place was occupied in more than so many times the scans that saw it free
 _CELL_M = 0.35  # points of one object are in neighbouring cells of this size, seen from above
 _MIN_POINTS = 3  # smaller clusters are noise
 _JUDGED_CELL_M = 0.15  # one point per cell of this size is looked up, and decides for the others
@@ -139,7 +140,7 @@ class FreeSpaceEvidence:
     times: tuple[AnyFloatArray, ...] = ()
     ground_m: float = math.nan
 
-    def thinned(self, most: int = 400) -> FreeSpaceEvidence:
+    def thinned(self, most: int = 2000) -> FreeSpaceEvidence:
         """Return the same with at most `most` of the `points` of each cluster; `clusters` stay
         complete.
         """
@@ -338,7 +339,7 @@ def _judge(
     in_a_row = np.bitwise_count(free & ~smeared).max(axis=0)
     moved = (seen_through >= _AGREEING) & (seen_through > occupied)
     left = ~moved & (in_a_row >= _IN_A_ROW)
-    return moved, left, ~(moved | left) & (occupied > seen_through)
+    return moved, left, ~(moved | left) & (occupied > _MIXED * seen_through)
 
 
 def _clusters(

@@ -19,18 +19,26 @@ import crowded
 import numpy as np
 import study
 from carlasc_recorders.town.actors import EGO_ID
-from movers_drives import Recorded, Setting, record_all
+from movers_drives import GRIDS, Recorded, Setting, owners, record_all
 from movers_rows import EVIDENCE, NoisyPoses, Only
 from numpy.typing import NDArray
 
+from carlasc.captures.settings import EGO_SENSOR_M
+from carlasc.core.frames import FrameRange
+from carlasc.core.geometry import invert, transform_points, translation
+from carlasc.groundtruth import Voting
 from carlasc.groundtruth.from_scans.feed import ScanFeed
+from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
+from carlasc.groundtruth.inputs import GridPlan
 from carlasc.motion.tracks import MovingActors
+from carlasc.storage import Sequence
 
 SEEDS = {"crowded": range(361, 366)}
 NEAR_M = 25.0
 MOVES_M_S = 0.4  # faster actors move
 KINDS = ("car", "truck", "rider", "person")
+_ABOVE_M = 0.3  # wheels and feet below are beside ground, which is occupied
 _SEEN = 5, 20  # an actor counts with so many points in so many scans
 
 
@@ -69,6 +77,7 @@ class Scores:
         owners: number of points of each simulated actor, 0 for none, by found actor.
         cpu_s: time per scan.
         points: number of points per scan.
+        trail: of the ground truth of the middle frame, in percent: see `trail`.
     """
 
     counts: dict[str, Counted] = field(default_factory=dict)
@@ -76,6 +85,7 @@ class Scores:
     owners: dict[int, Counter[int]] = field(default_factory=dict)
     cpu_s: float = 0.0
     points: float = 0.0
+    trail: float = np.nan
 
 
 def score(drive: Recorded, actors: MovingActors, kinds: dict[int, str]) -> Scores:
@@ -106,6 +116,33 @@ def score(drive: Recorded, actors: MovingActors, kinds: dict[int, str]) -> Score
     return found
 
 
+def trail(drive: Recorded, feed: ScanFeed, actors: MovingActors, crowd: crowded.Crowd) -> float:
+    """Return the share, in percent, of the voxels that movers passed at other times and that are
+    empty in the frame, which its ground truth calls occupied.
+    """
+    frame, spec, sequence = crowded.FRAMES // 2, GRIDS["0.2 m"], drive.sequence
+    if study.is_tiny():
+        frame = 4
+    voting = Voting(keep_evidence=True)
+    plan = GridPlan(spec, "grid", EVIDENCE, voting, FrameRange())
+    grid = merge_frame(plan, feed, actors, frame, feed.reaching(frame, spec)).grid
+    world_T_grid, passed, held = sequence.read_pose(frame), set[int](), set[int]()
+    for other in sequence.frames("points").tolist():
+        points = sequence.read("points", other)[:, :3]
+        fast = np.linalg.norm(sequence.read("flow", other), axis=1) > MOVES_M_S
+        there = transform_points(invert(world_T_grid) @ sequence.read_pose(other), points)
+        voxels = spec.flat_index(there)
+        above = there[:, 2] > _ABOVE_M - EGO_SENSOR_M[2]
+        if other != frame:
+            passed.update(voxels[fast & above].tolist())
+        held.update(voxels[~fast | (other == frame)].tolist())
+    ego = crowd.ego_pose(frame) @ translation(EGO_SENSOR_M)
+    here = [actor for actor in crowd.at(frame) if np.hypot(*actor.world_T_actor[:2, 3]) < 200]
+    held.update(np.flatnonzero(owners(here, invert(ego), spec)).tolist())
+    empty = np.array(sorted(passed - held - {-1}))
+    return 100 * float((grid.labels.reshape(-1)[empty] != 0).mean())
+
+
 def row(name: str, scores: Scores, actors: MovingActors) -> str:
     """Return the row of a drive."""
     truth = {number for number, scans in scores.truth.items() if scans >= _SEEN[0]}
@@ -121,7 +158,7 @@ def row(name: str, scores: Scores, actors: MovingActors) -> str:
         *(f"{c.share('tracked'):.1f} / {c.share('moved'):.1f}" for c in moving),
         f"{scores.counts['parked'].share('tracked'):.1f}",
         f"{scores.counts['static'].share('tracked'):.2f}",
-        f"{100 * left:.1f}",
+        f"{100 * left:.1f}, {scores.trail:.1f}",
         f"{len(owners)} / {len(truth)}",
         f"{len(truth & set(best))}",
         f"{merged}",
@@ -136,15 +173,17 @@ def row(name: str, scores: Scores, actors: MovingActors) -> str:
 def measure(setting: Setting, work: Path, *, noisy: bool = False) -> str:
     """Return the row of a drive, which is recorded unless it was."""
     (drive,) = record_all([setting], work)
-    sequence = NoisyPoses(0.02, 0.1)(drive, 0) if noisy else drive.sequence
-    bare = Only(sequence, ("points", "seconds", "origins"))
+    bare: Sequence = Only(drive.sequence, ("points", "seconds", "origins"))
+    if noisy:
+        bare = bare.with_poses(NoisyPoses(0.02, 0.1)(drive, 0).poses)
     feed = ScanFeed(bare, EVIDENCE)
     start = time.process_time()
     actors = find_actors(feed)
     cpu_s = (time.process_time() - start) / len(feed.frames)
-    users = crowded.CrowdedDrive(setting.seed).crowd.users
-    scores = score(drive, actors, {EGO_ID + k: user.kind for k, user in enumerate(users)})
-    scores.cpu_s = cpu_s
+    crowd = crowded.CrowdedDrive(setting.seed).crowd
+    kinds = {EGO_ID + k: user.kind for k, user in enumerate(crowd.users)}
+    scores = score(drive, actors, kinds)
+    scores.cpu_s, scores.trail = cpu_s, trail(drive, feed, actors, crowd)
     return row(str(setting), scores, actors)
 
 

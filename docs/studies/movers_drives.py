@@ -337,7 +337,7 @@ def _see(name: str, seed: int, grids: Mapping[str, GridSpec]) -> dict[str, NDArr
                 grid.labels,
                 grid.known,
             )
-            arrays[f"{frame} {size} owner"] = _owners(actors, invert(pose), spec)
+            arrays[f"{frame} {size} owner"] = owners(actors, invert(pose), spec)
     return arrays
 
 
@@ -360,7 +360,7 @@ def choose_frames(drive: TownDrive, kind: Kind) -> list[int]:
     return sorted(kind.candidates[int(row)] for row in best)
 
 
-def _owners(actors: list[TownActor], grid_T_world: Transform, spec: GridSpec) -> NDArray[np.uint16]:
+def owners(actors: list[TownActor], grid_T_world: Transform, spec: GridSpec) -> NDArray[np.uint16]:
     """Return the actor that each voxel may belong to; the smaller one where boxes overlap."""
     owner = np.zeros(spec.num_voxels, np.uint16)
     centers = spec.from_axes(spec.centers()).reshape(-1, 3)
