@@ -2,8 +2,9 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
-from helpers.converters.bags import Messages, drive_messages, write_bag
+from helpers.converters.bags import START_NS, Messages, drive_messages, write_bag
 from helpers.errors import raises
 
 import carlasc
@@ -112,6 +113,38 @@ def test_places_that_nothing_can_read_are_refused(tmp_path, kind):
         carlasc.map(place, tmp_path / "a.ply", **GIVEN)
     assert str(place) in str(error.value)
     assert not (tmp_path / ".carlasc").exists()
+
+
+def test_bags_without_one_lidar_say_so_although_they_are_folders(tmp_path):
+    store = Messages("mcap")
+    for name, count in (("none", 0), ("two", 2)):
+        (tmp_path / name).mkdir()
+        points = np.zeros(9, [(axis, np.float32) for axis in "xyz"])
+        clouds = [store.cloud(f"/{number}", START_NS, points) for number in range(count)]
+        write_bag(tmp_path / name, "mcap", clouds or [store.imu("/imu", START_NS)], store=store)
+    with raises(MissingDataError, where="drive.mcap", found="/imu"):
+        carlasc.map(tmp_path / "none" / "drive", tmp_path / "a.ply", **GIVEN)
+    with raises(ArgumentError, where="topics", advice='`converter="bag"`'):
+        carlasc.map(tmp_path / "two" / "drive", tmp_path / "a.ply", **GIVEN)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["none", "two"]
+
+
+def test_scans_without_points_or_without_overlap_are_one_line_that_names_them(recording, tmp_path):
+    (tmp_path / "empty").mkdir()
+    for number in range(DRIVE.frames):
+        np.save(tmp_path / "empty" / f"{number}.npy", np.full((50, 3), np.nan, np.float32))
+    given = RecordingOptions("scans", options={"pose_file": str(recording / "poses.txt")})
+    with raises(MissingDataError, where=str(tmp_path / "empty"), found="none of 5"):
+        carlasc.map(tmp_path / "empty", tmp_path / "a.ply", recording=given, **GIVEN)
+    assert not list(tmp_path.glob(".carlasc/recording*"))
+    poses = np.loadtxt(recording / "poses.txt")
+    poses[:, 1] += 100 * np.arange(len(poses))
+    np.savetxt(tmp_path / "other.txt", poses)
+    read = RecordingOptions("scans", options={"pose_file": str(tmp_path / "other.txt")})
+    checked = GIVEN | {"poses": PoseOptions("file", "never")}
+    with raises(FormatError, where=str(recording / "scans")):
+        carlasc.map(recording / "scans", tmp_path / "a.ply", recording=read, **checked)
+    assert not (tmp_path / "a.ply").exists()
 
 
 def test_what_would_be_read_again_is_refused(recording, tmp_path):
