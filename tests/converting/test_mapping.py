@@ -1,5 +1,9 @@
 """`carlasc map` of recordings: they are converted into a hidden folder, and mapped from there."""
 
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -161,3 +165,37 @@ def test_what_would_be_read_again_is_refused(recording, tmp_path):
     with raises(ArgumentError, where="keep"):
         other = RecordingOptions(keep=tmp_path / "other")
         carlasc.map(tmp_path / "kept", tmp_path / "a.ply", recording=other, **GIVEN)
+
+
+@pytest.mark.slow
+def test_a_map_that_is_killed_goes_on_from_what_it_kept(recording, tmp_path):
+    """The moments are those at which files appear: scans, and the cells of the map."""
+    call = [
+        sys.executable,
+        "-m",
+        "carlasc",
+        "map",
+        str(recording / "scans"),
+        "--converter",
+        "scans",
+    ]
+    call += ["--pose-file", str(recording / "poses.txt"), "--force", "--workers", "1"]
+    kept = tmp_path / ".carlasc" / "recording-a.ply"
+    for pattern, ending in (
+        (".carlasc/recording-a.ply/**/*.bin", signal.SIGINT),
+        (".a.ply.*.part", signal.SIGKILL),
+    ):
+        with subprocess.Popen([*call, "a.ply"], cwd=tmp_path, stderr=subprocess.PIPE) as run:
+            before = set(tmp_path.glob(pattern))
+            while run.poll() is None and not set(tmp_path.glob(pattern)) - before:
+                time.sleep(0.002)
+            run.send_signal(ending)
+            said = run.stderr.read().decode()
+        assert not (tmp_path / "a.ply").exists() and any(kept.rglob("*.bin"))
+        if ending == signal.SIGINT:
+            assert run.returncode == 130 and "same command" in said, said
+    for name in ("a.ply", "b.ply"):
+        subprocess.run([*call, name], cwd=tmp_path, check=True)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".carlasc", "a.ply", "b.ply"]
+    assert not [path for path in (tmp_path / ".carlasc").iterdir() if path.is_dir()]
