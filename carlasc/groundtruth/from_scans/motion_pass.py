@@ -52,7 +52,7 @@ TRACKS, POSES = "tracks", "poses"
 
 # of the methods: a version changes only when the same input gives another result
 _VERSIONS = {
-    TRACKS: 9,
+    TRACKS: 10,
     POSES: 2,
 }
 _NOTED_M = 0.04  # if scans disagree by more and poses do not change, there is a note
@@ -150,7 +150,8 @@ def find_actors(
     found += _estimate(feed, run, [*waiting, *map(_observed, follower.finish())])
     found = [track for track in found if track.instance not in follower.riders]
     tracks += found
-    moving = _untracked(follower.moved, found)
+    # points of what is too large for one actor moved, but not together
+    moving = _untracked(follower.moved, [track for track in found if track.is_possible])
     return MovingActors.of(tracks if boxes else complete_bodies(tracks), moving, follower.own)
 
 
