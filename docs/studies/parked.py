@@ -39,11 +39,10 @@ def measure(seed: int, folder: Path) -> list[float]:
     poses = np.stack([drive.sensor_poses(frame, 1)[0] for frame in range(drive.frames)])
     poses = relative_to(poses[0], poses)
     scans = {frame: drive.record(frame).scan for frame in chosen}
+    times = np.array([frame * FRAME_PERIOD_S for frame in range(drive.frames)])
     with FolderSink(folder).sequence("cartesian") as writer:
         writer.write_document(layout.POSES, layout.encode_poses(poses))
-        writer.write_document(
-            layout.TIMES, layout.encode_times(np.arange(drive.frames) * FRAME_PERIOD_S)
-        )
+        writer.write_document(layout.TIMES, layout.encode_times(times))
         writer.write_document(layout.METADATA, Metadata("right", source="town").to_json())
         for frame, scan in scans.items():
             rows = np.column_stack([scan.points[:, :3], np.zeros(len(scan.points))])
@@ -57,6 +56,7 @@ def measure(seed: int, folder: Path) -> list[float]:
     for frame, scan in scans.items():
         away = np.linalg.norm(scan.points[:, :2], axis=1)
         own = scan.points[away < RANGE_M, :3].astype(np.float64)
+        assert scan.instances is not None
         number = scan.instances[away < RANGE_M]
         kept = np.isfinite(
             tree.query(transform_points(poses[frame], own), distance_upper_bound=NEAR_M)[0]
