@@ -15,7 +15,7 @@ from carlasc.converting.protocol import Failure, check_outside
 from carlasc.converting.registry import find_recordings, open_converter, readers_of
 from carlasc.converting.run import convert, source_states
 from carlasc.core.frames import FrameRange, Frames
-from carlasc.errors import ArgumentError, CarlascError, check_types
+from carlasc.errors import ArgumentError, CarlascError, MissingDataError, check_types
 from carlasc.groundtruth.maps.map_files import MapFiles
 from carlasc.groundtruth.maps.mapping import only, with_neighbours, write_grid, write_map
 from carlasc.inspection.findings import Finding
@@ -30,6 +30,7 @@ from carlasc.storage.protocol import Source
 from carlasc.storage.transport.trees import is_url
 
 _LEAST_CELL_M = 0.001  # smaller cells are finer than float32 positions
+_BAGS = (".bag", ".db3", ".mcap")
 _ANY_LIDAR = "scans"  # the converter of bare scans, which may also read folders of other data sets
 
 
@@ -186,7 +187,12 @@ def map(
         states = sequence_states(drive, *([f"{grid}/labels", f"{grid}/counts"] if grid else []))
     else:
         root = Path(source)
-        recordings = find_recordings(open_converter(reader, root, options))
+        try:
+            recordings = find_recordings(open_converter(reader, root, options))
+        except ArgumentError as error:  # of an option that `carlasc map` has only then
+            if recording.converter is None:
+                error.advice += f', with `converter="{reader}"`'
+            raise
         only(recordings, [one.location for one in recordings])
         of_places = source_states(root, recordings, options)
         states = {name: state for of in of_places.values() for name, state in of.items()}
@@ -218,12 +224,26 @@ def map(
             options=options,
             run=replace(run, progress=steps.stage()),
         )
+        if not made.made + made.skipped:
+            if keep is None:
+                shutil.rmtree(place)
+            raise MissingDataError(
+                root,
+                expected="scans with points that can be read",
+                found=f"none of {len(made.failures)}",
+                advice=" ".join(str(failure.message) for failure in made.failures[:1]),
+            )
         drive, poses = as_source(made.sequences[0]), replace(poses, source="file")
-    if grid is None:
-        spread = replace(run, progress=steps.stage())
-        content = write_map(drive, files, wanted, cell_m, motion, poses, keep_parked, spread)
-    else:
-        content = write_grid(drive, grid, wanted, files)
+    try:
+        if grid is None:
+            spread = replace(run, progress=steps.stage())
+            content = write_map(drive, files, wanted, cell_m, motion, poses, keep_parked, spread)
+        else:
+            content = write_grid(drive, grid, wanted, files)
+    except CarlascError as error:
+        if made is not None and keep is None:  # a hidden folder says nothing to the user
+            error.where = error.where.replace(made.sequences[0], str(root))
+        raise
     record.write(keeper, kept)
     notes = (*(made.notes if made else ()), *content.notes)
     if made is not None and keep is None:
@@ -265,5 +285,8 @@ def _reader_of(source: AnyPath, grid: str | None) -> str | None:
             expected=f"the converter of {source}",
             found="none given, and several that can read it: " + ", ".join(names),
         )
-    # one that finds nothing says what it expects
-    return names[0] if names else "bag" if Path(source).is_file() else _ANY_LIDAR
+    if names:
+        return names[0]
+    place = Path(source)  # what cannot be read says what it expects
+    inner = [place] if place.is_file() else place.iterdir()
+    return "bag" if any(path.suffix in _BAGS or path == place for path in inner) else _ANY_LIDAR

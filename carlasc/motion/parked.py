@@ -37,7 +37,7 @@ from carlasc.motion.tracks import LONGEST_M
 # Scans that are used are so far apart; another pass is so far away along the drive and in time, and
 # so near in space, sideways and in height.
 _STEP_M, _APART_M, _APART_S, _NEAR_M, _LEVEL_M = 1.0, 60.0, 2 * HORIZON_S, 12.0, 2.0
-_VIEWS = 10  # most scans of a pass that a point is looked up in
+_PASSES, _VIEWS = 6, 10  # most passes, and scans of a pass, that a point is looked up in
 _AGREEING, _SURE = 3, 4  # least number of them that saw its place free, also per one that did not
 # Poses of passes may be wrong by so much: what another pass saw beside the place is no free space.
 _SHIFTS_M = ((0.0, 0.0), (0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))
@@ -58,7 +58,7 @@ those of which none did and one saw it occupied, and those in which it is near t
 
 
 def other_passes(positions: FloatArray, seconds: FloatArray) -> dict[int, list[IntArray]]:
-    """Return the rows of scans of each other pass, by the row of a scan that has any.
+    """Return the rows of scans of other passes, by the row of a scan that has any.
 
     Args:
         positions: (F, 3) metres, world.
@@ -75,7 +75,11 @@ def other_passes(positions: FloatArray, seconds: FloatArray) -> dict[int, list[I
         rows = used[near & (np.abs(seconds[used] - seconds[row]) > _APART_S)]
         if len(rows):
             ends = np.flatnonzero(np.diff(along[rows]) > 2 * _NEAR_M) + 1
-            found[row] = [one[spread_rows(len(one), _VIEWS)] for one in np.split(rows, ends)]
+            passes = np.split(rows, ends)
+            found[row] = [
+                passes[number][spread_rows(len(passes[number]), _VIEWS)]
+                for number in spread_rows(len(passes), _PASSES)
+            ]
     return found
 
 

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable
 from itertools import chain
 from pathlib import Path
@@ -159,7 +160,8 @@ def _read_csv(path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray
             columns = tuple(words)
         elif first:
             lines = chain([first.replace(",", ".") if separator == ";" else first], lines)
-        table = np.loadtxt(lines, np.float64, delimiter=separator, ndmin=2, quotechar='"')
+        with warnings.catch_warnings(action="ignore"):  # a file without points is an error later
+            table = np.loadtxt(lines, np.float64, delimiter=separator, ndmin=2, quotechar='"')
     if named and not table.size:
         table = np.empty((0, len(words)))
     return _named(table, path, columns)

@@ -193,7 +193,20 @@ class Scans(Converter):
             raise FormatError(
                 folder, expected="scans of one format", found=counts, advice="move the others away"
             )
-        return sorted((path for path in files if path.suffix.lower() in scans), key=_natural)
+        chosen = sorted((path for path in files if path.suffix.lower() in scans), key=_natural)
+        numbers = dict[str, set[tuple[str, ...]]]()  # by the other parts of names
+        for path in chosen:
+            name = re.sub(r"\d+", "#", path.stem)
+            numbers.setdefault(name, set()).add(tuple(re.findall(r"\d+", path.stem)))
+        if len(numbers) > 1 and set.intersection(*numbers.values()) - {()}:
+            raise FormatError(
+                folder,
+                expected="the scans of one LiDAR",
+                found=f"several of the same numbers: {', '.join(sorted(numbers))}",
+                advice="put those of each LiDAR into a folder, and give one of these, or the poses "
+                "of the LiDARs with `calibration`",
+            )
+        return chosen
 
     def _check_counts(self, files: dict[str, list[Path]]) -> None:
         if len({len(paths) for paths in files.values()}) > 1:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -35,12 +35,14 @@ class _OnRoute(Population):
 
     def __init__(self, others: Population, poses: Sequence[Transform]) -> None:
         self._others, self._poses = others, poses
+        self.gone: Callable[[TownActor, int], bool] = lambda actor, frame: False
 
     def ego_pose(self, frame: int) -> Transform:
         return self._poses[frame]
 
     def at(self, frame: int) -> list[TownActor]:
         first, *others = self._others.at(frame)
+        others = [actor for actor in others if not self.gone(actor, frame)]
         return [replace(first, world_T_actor=self._poses[frame]), *others]
 
 
@@ -56,8 +58,21 @@ class ReturningDrive(TownDrive):
         super().__init__(seed, "light", lidar)
         rows = [row * _COLUMNS + column for row, column in ROUTES[route]]
         poses = _poses(self.town.streets.nodes[rows])
-        self._population = _OnRoute(self._population, poses)
+        self._population = self._on_route = _OnRoute(self._population, poses)
         self.frames = len(poses)
+
+    def leave_from(self, frame: int) -> list[int]:
+        """Let every other parked vehicle be gone from a frame on; return the numbers of all."""
+        every = [self._on_route.at(one) for one in (0, self.frames - 1)]
+        still = {actor.id: actor.world_T_actor for actor in every[0][1:]}
+        parked = sorted(
+            actor.id
+            for actor in every[1][1:]
+            if actor.id in still and np.array_equal(actor.world_T_actor, still[actor.id])
+        )
+        gone = set(parked[::2])
+        self._on_route.gone = lambda actor, now: now >= frame and actor.id in gone
+        return parked
 
 
 def _poses(nodes: NDArray[np.float64]) -> list[Transform]:

@@ -474,3 +474,13 @@ def test_a_folder_that_another_converter_reads_names_it(tmp_path):
     )
     with raises(MissingDataError, advice="this folder has CarlaSC.s layout already"):
         convert("argoverse2", tmp_path / "own", tmp_path / "out", run=Run(workers=1))
+
+
+def test_scans_of_two_lidars_in_one_folder_are_refused(tmp_path):
+    for name in ("front_0", "front_1", "rear_0", "rear_1"):
+        np.save(tmp_path / f"{name}.npy", np.ones((9, 3), np.float32))
+    with raises(FormatError, where=str(tmp_path), found="front_#, rear_#"):
+        Scans(tmp_path).sequences()
+    (tmp_path / "rear_0.npy").rename(tmp_path / "rear_2.npy")
+    (tmp_path / "rear_1.npy").rename(tmp_path / "rear_3.npy")
+    assert len(Scans(tmp_path).sequences()) == 1  # the end of the drive may have another name

@@ -1,9 +1,14 @@
 """`carlasc map` of recordings: they are converted into a hidden folder, and mapped from there."""
 
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 
+import numpy as np
 import pytest
-from helpers.converters.bags import Messages, drive_messages, write_bag
+from helpers.converters.bags import START_NS, Messages, drive_messages, write_bag
 from helpers.errors import raises
 
 import carlasc
@@ -114,6 +119,38 @@ def test_places_that_nothing_can_read_are_refused(tmp_path, kind):
     assert not (tmp_path / ".carlasc").exists()
 
 
+def test_bags_without_one_lidar_say_so_although_they_are_folders(tmp_path):
+    store = Messages("mcap")
+    for name, count in (("none", 0), ("two", 2)):
+        (tmp_path / name).mkdir()
+        points = np.zeros(9, [(axis, np.float32) for axis in "xyz"])
+        clouds = [store.cloud(f"/{number}", START_NS, points) for number in range(count)]
+        write_bag(tmp_path / name, "mcap", clouds or [store.imu("/imu", START_NS)], store=store)
+    with raises(MissingDataError, where="drive.mcap", found="/imu"):
+        carlasc.map(tmp_path / "none" / "drive", tmp_path / "a.ply", **GIVEN)
+    with raises(ArgumentError, where="topics", advice='`converter="bag"`'):
+        carlasc.map(tmp_path / "two" / "drive", tmp_path / "a.ply", **GIVEN)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["none", "two"]
+
+
+def test_scans_without_points_or_without_overlap_are_one_line_that_names_them(recording, tmp_path):
+    (tmp_path / "empty").mkdir()
+    for number in range(DRIVE.frames):
+        np.save(tmp_path / "empty" / f"{number}.npy", np.full((50, 3), np.nan, np.float32))
+    given = RecordingOptions("scans", options={"pose_file": str(recording / "poses.txt")})
+    with raises(MissingDataError, where=str(tmp_path / "empty"), found="none of 5"):
+        carlasc.map(tmp_path / "empty", tmp_path / "a.ply", recording=given, **GIVEN)
+    assert not list(tmp_path.glob(".carlasc/recording*"))
+    poses = np.loadtxt(recording / "poses.txt")
+    poses[:, 1] += 100 * np.arange(len(poses))
+    np.savetxt(tmp_path / "other.txt", poses)
+    read = RecordingOptions("scans", options={"pose_file": str(tmp_path / "other.txt")})
+    checked = GIVEN | {"poses": PoseOptions("file", "never")}
+    with raises(FormatError, where=str(recording / "scans")):
+        carlasc.map(recording / "scans", tmp_path / "a.ply", recording=read, **checked)
+    assert not (tmp_path / "a.ply").exists()
+
+
 def test_what_would_be_read_again_is_refused(recording, tmp_path):
     with pytest.raises(ConflictError):
         make(recording, recording / "scans" / "clean.pcd")
@@ -128,3 +165,37 @@ def test_what_would_be_read_again_is_refused(recording, tmp_path):
     with raises(ArgumentError, where="keep"):
         other = RecordingOptions(keep=tmp_path / "other")
         carlasc.map(tmp_path / "kept", tmp_path / "a.ply", recording=other, **GIVEN)
+
+
+@pytest.mark.slow
+def test_a_map_that_is_killed_goes_on_from_what_it_kept(recording, tmp_path):
+    """The moments are those at which files appear: scans, and the cells of the map."""
+    call = [
+        sys.executable,
+        "-m",
+        "carlasc",
+        "map",
+        str(recording / "scans"),
+        "--converter",
+        "scans",
+    ]
+    call += ["--pose-file", str(recording / "poses.txt"), "--force", "--workers", "1"]
+    kept = tmp_path / ".carlasc" / "recording-a.ply"
+    for pattern, ending in (
+        (".carlasc/recording-a.ply/**/*.bin", signal.SIGINT),
+        (".a.ply.*.part", signal.SIGKILL),
+    ):
+        with subprocess.Popen([*call, "a.ply"], cwd=tmp_path, stderr=subprocess.PIPE) as run:
+            before = set(tmp_path.glob(pattern))
+            while run.poll() is None and not set(tmp_path.glob(pattern)) - before:
+                time.sleep(0.002)
+            run.send_signal(ending)
+            said = run.stderr.read().decode()
+        assert not (tmp_path / "a.ply").exists() and any(kept.rglob("*.bin"))
+        if ending == signal.SIGINT:
+            assert run.returncode == 130 and "same command" in said, said
+    for name in ("a.ply", "b.ply"):
+        subprocess.run([*call, name], cwd=tmp_path, check=True)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".carlasc", "a.ply", "b.ply"]
+    assert not [path for path in (tmp_path / ".carlasc").iterdir() if path.is_dir()]

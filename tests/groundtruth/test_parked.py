@@ -129,3 +129,10 @@ def test_passes_are_far_in_time_and_along_the_drive_and_near_in_space():
     assert (rows > len(places) // 2).all()
     assert not other_passes(places[: len(places) // 2], np.arange(len(places) // 2) * FRAME_S)
     assert not other_passes(places, np.zeros(len(places)))
+
+
+def test_a_street_that_is_driven_often_is_compared_with_a_few_of_its_passes():
+    laps = np.tile(np.r_[np.arange(0.0, 90), np.arange(90.0, 0, -1)], 20)
+    passes = other_passes(np.stack([laps, 0 * laps, 0 * laps], axis=1), np.arange(len(laps)) * 1.0)
+    assert max(map(len, passes.values())) == 6
+    assert min(map(len, passes.values())) >= 5

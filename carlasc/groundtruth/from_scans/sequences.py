@@ -510,7 +510,8 @@ def _check_speed(sequence: Sequence, frames: IntArray, where: str) -> None:
             where,
             expected=f"at most {_MAX_SPEED_M_S:g} m/s and {_MAX_TURN_RAD_S:g} rad/s",
             found=f"{found} ({len(jumps)} in all)",
-            advice="fix the poses, or continue with `force=True`",
+            advice="fix the poses (estimated ones jump where scans do not overlap), or continue "
+            "with `force=True`",
         )
 
 

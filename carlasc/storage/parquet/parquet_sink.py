@@ -14,6 +14,7 @@ from carlasc.storage import layout
 from carlasc.storage.files import (
     AnyPath,
     parse_json,
+    remove,
     remove_file,
     remove_stale,
     sync_tree,
@@ -25,7 +26,6 @@ from carlasc.storage.packed.output import (
     UNFINISHED_MARK,
     DeferredErrorFile,
     put_in_place,
-    remove,
 )
 from carlasc.storage.packed.stores import (
     VERSION,
