@@ -29,6 +29,7 @@ from carlasc.core.arrays import (
 )
 from carlasc.core.cells import as_pose
 from carlasc.core.classes import ClassTable
+from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, invert, moved_back, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import RaysFromPlace, lengths, runs_of_origins
@@ -85,6 +86,36 @@ class Cast(NamedTuple):
     map_T_places: FloatArray
     lower: FloatArray
     upper: FloatArray
+
+
+@cached
+def passed_by(
+    points: Float32Array, ends: IntArray, poses: FloatArray, places: FloatArray, size_m: float
+) -> BoolArray:
+    """Return (M,) bool: which places rays pass through.
+
+    Args:
+        points: (N, 3) as in `Cast`.
+        ends: (K,) as in `Cast`.
+        poses: (K, 4, 4) of the origins, as in `Cast`.
+        places: (M, 3) metres, frame of the map.
+        size_m: size of a place. A ray passes nearer than a quarter of it to the middle, and ends
+            farther than it behind the middle.
+    """
+    passed, first = np.zeros(len(places), np.bool_), 0
+    for end, pose in zip(ends, poses):  # noqa: B905 (compiled)
+        for row in range(first, end):
+            x, y, z = points[row]
+            reach = np.sqrt(np.float64(x * x + y * y + z * z))
+            ray = (pose[:3, 0] * x + pose[:3, 1] * y + pose[:3, 2] * z) / reach
+            for i in range(len(places)):
+                if not passed[i]:
+                    offset = places[i] - pose[:3, 3]
+                    along = (offset * ray).sum()
+                    beside = (offset * offset).sum() - along * along
+                    passed[i] = 0 < along < reach - size_m and beside < size_m * size_m / 16
+        first = end
+    return passed
 
 
 @dataclass(frozen=True)
