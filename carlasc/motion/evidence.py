@@ -51,6 +51,7 @@ _IN_A_ROW = 4  # the same, if all scans on one side in time, from the farthest i
 # Every third scan is looked up first. A place that so many scans saw occupied, and none saw free,
 # is static.
 _EVERY, _SURE = 3, 4
+_MIXED = 2  # a static place was occupied in more than so many times the scans that saw it free
 _CELL_M = 0.35  # points of one object are in neighbouring cells of this size, seen from above
 _MIN_POINTS = 3  # smaller clusters are noise
 _JUDGED_CELL_M = 0.15  # one point per cell of this size is looked up, and decides for the others
@@ -59,6 +60,7 @@ _BAND_M = (
 )
 _FLAGGED_SHARE = 0.6  # a cluster with this share of moved points moved as a whole
 _PERIOD_S = 0.1  # period of scans whose times do not increase
+_AROUND_M = 6.0  # ground so near to the sensor, along each axis, gives its height
 OWN_CELL_M, OWN_CELLS = 0.2, 40
 OWN_REACH_M = OWN_CELL_M * OWN_CELLS / 2
 """Parts of the recording vehicle are found in so many cells of this size along each axis, around
@@ -122,6 +124,7 @@ class FreeSpaceEvidence:
         world_T_sensor: (4, 4) pose of the scan.
         near: (K,) cells of the points around the sensor that are not ground: see `cells_around`.
         times: seconds of the `points` after the time of the scan; empty if they are unknown.
+        ground_m: height of the ground around the sensor, metres, sensor frame; NaN without any.
     """
 
     frame: int
@@ -135,8 +138,9 @@ class FreeSpaceEvidence:
     world_T_sensor: Transform
     near: IntArray
     times: tuple[AnyFloatArray, ...] = ()
+    ground_m: float = math.nan
 
-    def thinned(self, most: int = 400) -> FreeSpaceEvidence:
+    def thinned(self, most: int = 2000) -> FreeSpaceEvidence:
         """Return the same with at most `most` of the `points` of each cluster; `clusters` stay
         complete.
         """
@@ -252,9 +256,10 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     parts = (tuple(clusters), tuple(points), tuple(classes), freed, around)
     near = cells_around(scan.points[candidates])
     times = () if scan.times is None else tuple(scan.times[members] for members in clusters)
-    return FreeSpaceEvidence(
-        scan.frame, own.seconds, len(scan.points), *parts, scan.world_T_sensor, near, times
-    )
+    below = scan.points[ground & (np.abs(scan.points[:, :2]) < _AROUND_M).all(axis=1), 2]
+    height = float(np.median(below)) if len(below) else math.nan
+    about = *parts, scan.world_T_sensor, near, times, height
+    return FreeSpaceEvidence(scan.frame, own.seconds, len(scan.points), *about)
 
 
 def cells_around(points: AnyFloatArray) -> IntArray:
@@ -334,7 +339,7 @@ def _judge(
     in_a_row = np.bitwise_count(free & ~smeared).max(axis=0)
     moved = (seen_through >= _AGREEING) & (seen_through > occupied)
     left = ~moved & (in_a_row >= _IN_A_ROW)
-    return moved, left, ~(moved | left) & (occupied > seen_through)
+    return moved, left, ~(moved | left) & (occupied > _MIXED * seen_through)
 
 
 def _clusters(

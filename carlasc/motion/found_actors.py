@@ -11,7 +11,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from carlasc.core.arrays import BoolArray, FloatArray, IntArray
-from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
+from carlasc.core.geometry import (
+    Transform,
+    invert,
+    multiply,
+    rotation_z,
+    spread_rows,
+    thin,
+    transform_points,
+)
 from carlasc.motion.evidence import (
     OWN_CELL_M,
     OWN_CELLS,
@@ -35,12 +43,16 @@ _MIN_OBSERVATIONS, _MIN_PATH_M, _MIN_SPEED_M_S = 5, 1.0, 0.5  # an actor needs s
 _STRAIGHT = 0.35  # least extent of a path over its length: noise moves back and forth
 _MAX_JUMP_M_S = 4.0  # greatest median deviation of the observations' steps from the path's
 _PARTS_M = 1.0  # parts of one vehicle are closer to each other
+_BESIDE_RAD = 0.012  # and no wider gap is between their directions
+# So high things that are not longer are a rider or a person, and no part of something else.
+_WHOLE_M = (1.1, 2.2, 2.4)
 _PERSON_M = (1.5, 2.3)  # actors that are narrower and lower change their shape as they move
 _SHIFT_M = (
     0.5  # observations are shifted along their path by so much, to test whether they still align
 )
 _OBSERVATIONS, _MANY_OBSERVATIONS = 10, 30  # more than the latter do not raise the confidence
 _WEIGHTS = (1.0, 1.5, -12.5, 5.0, 1.5, -4.5)  # of 1 and of the terms of `_confidence`
+_EXCUSED = 1.5  # static neighbours do not count from a gain of one over this
 _LEAST_CONFIDENCE = 0.5  # of an actor
 _STAYS_M, _SENSOR_PATH_M = 0.5, 1.0  # points that move with the sensor, while it drives so far
 _LINE_SLOPE = 0.004  # a quarter of a degree: the points of one scan line differ by less
@@ -50,7 +62,14 @@ _LINE_SLOPE = 0.004  # a quarter of a degree: the points of one scan line differ
 # cannot be told from a person who walks beside the sensor at exactly its pace.
 _ALWAYS, _FREED, _OFTEN = 0.95, 0.3, 0.3
 _BESIDE_M = 1.8  # farther beside the way of the sensor, another vehicle may drive along
+# What stands on the ground beside the sensor is a rider or a person, who keeps its pace: so near
+# above the ground, and so high and not longer.
+_FOOT_M, _STANDS_M, _STRETCH_M = 0.6, 1.0, 2.6
 _OWN_SHARE = 0.5  # an actor with so many points in these cells is none
+# A cluster is split between chains of so many observations, whose middles are expected so near to
+# it, and whose velocities differ by so much. So many points of their last ones stand for them.
+_KNOWN, _NEAR_M, _APART_M_S, _MODEL = 3, 0.2, 1.0, 80
+_KEPT = 400  # points of an observation that are kept
 _SAMPLES = 300  # points of an observation that its path is estimated from
 
 
@@ -103,6 +122,7 @@ class ActorFollower:
         self._near, self._freed = np.zeros((2, OWN_CELLS**3), np.int64)
         self._cells: dict[int, list[IntArray]] = {}
         self._poses: list[Transform] = []
+        self._grounds: list[float] = []
         self._close: list[tuple[int, IntArray, IntArray]] = []
         self._deformable, self._label, self._number = deformable, default_label, first_instance
         self._alive: list[_ActorChain] = []
@@ -113,6 +133,8 @@ class ActorFollower:
         """
         self.moved[scan.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
         self._poses.append(scan.world_T_sensor)
+        if np.isfinite(scan.ground_m):
+            self._grounds.append(scan.ground_m)
         self._near[scan.near] += 1
         sensor_T_world = invert(scan.world_T_sensor)
         for members, points in zip(scan.clusters, scan.points, strict=True):
@@ -163,7 +185,26 @@ class ActorFollower:
         own &= (across_m < _BESIDE_M)[..., None]
         while (more := _widened(own) & ~own & (freed >= _OFTEN * scans)).any():
             own |= more
-        return own
+        left, parts = own.copy(), own
+        while left.any():
+            part = np.zeros_like(own)
+            part.flat[left.argmax()] = True
+            while (more := _widened(part) & left & ~part).any():
+                part |= more
+            left &= ~part
+            if self._stands(np.argwhere(part)):
+                parts = parts & ~part
+        return parts
+
+    def _stands(self, cells: IntArray) -> bool:
+        """Return whether (K, 3) cells that touch are of a rider or a person beside the sensor."""
+        if not self._grounds:
+            return False
+        lower, upper = (cells.min(axis=0), cells.max(axis=0) + 1)
+        size = (upper - lower) * OWN_CELL_M
+        foot = float((lower[2] - OWN_CELLS // 2) * OWN_CELL_M) - float(np.median(self._grounds))
+        stands = foot < _FOOT_M and size[2] > _STANDS_M
+        return bool(stands and np.hypot(size[0], size[1]) < _STRETCH_M)
 
     def _actors(self, chains: list[_ActorChain]) -> list[FoundActor]:
         actors = []
@@ -205,9 +246,43 @@ class _Link:
         return (self.lower + self.upper) / 2
 
     @property
+    def label(self) -> int:
+        return self.segment.label
+
+    def part(self, chosen: BoolArray) -> _Link:
+        """Return the observation of some of its points; members that were thinned out are where the
+        points beside them in the scan are.
+        """
+        one, points = self.segment, self.segment.points[chosen]
+        rows = spread_rows(len(one.members), len(one.points))
+        after = np.searchsorted(rows, np.arange(len(one.members)), side="right") - 1
+        members = one.members[chosen[np.maximum(after, 0)]]
+        times = None if one.times is None else one.times[chosen]
+        share = len(members) / len(one.members)
+        return replace(
+            self,
+            segment=replace(one, members=members, points=points, times=times),
+            lower=points.min(axis=0),
+            upper=points.max(axis=0),
+            freed=round(self.freed * share),
+            around=round(self.around * share),
+        )
+
+    def thinned(self, most: int) -> _Link:
+        """Return the same with at most `most` points, within the same bounds."""
+        return replace(self, segment=self.segment.thinned(most))
+
+    @property
     def is_small(self) -> bool:
         """Whether it is not larger than a person."""
         return _is_small(self.upper - self.lower)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it has the size of a rider or a person."""
+        length, width, height = self.upper - self.lower
+        low, high, long = _WHOLE_M
+        return bool(low < height < high and np.hypot(length, width) < long)
 
     def joined(self, other: _Link) -> _Link:
         """Return the two as one observation."""
@@ -253,6 +328,25 @@ class _ActorChain:
         slopes = (offsets[:, None, None] * corners).sum(axis=0) / np.square(offsets).sum()
         least = np.take_along_axis(slopes, np.abs(slopes).argmin(axis=0)[None], axis=0)[0]
         return np.where(np.abs(slopes).max(axis=0) > 0, (least + slopes[1]) / 2, 0.0)
+
+    def expected(self, link: _Link) -> FloatArray | None:
+        """Return (M, 3) points of the actor, metres, world, where they are expected in the scan of
+        an observation; None unless they are expected in its place, or nothing is known yet.
+        """
+        velocity = self.velocity
+        if velocity is None or len(self.links) < _KNOWN or self.last.segment.label != link.label:
+            return None
+        shift = velocity * (link.seconds - self.last.seconds)
+        middle = self.last.middle + shift
+        inside = (middle > link.lower - _NEAR_M) & (middle < link.upper + _NEAR_M)
+        return thin(self.last.segment.points, _MODEL) + shift if inside[:2].all() else None
+
+    def is_apart(self, other: _ActorChain) -> bool:
+        """Whether it cannot be a part of the same actor."""
+        if self.last.is_whole and other.last.is_whole:
+            return True
+        assert self.velocity is not None and other.velocity is not None
+        return float(np.hypot(*(self.velocity - other.velocity)[:2])) > _APART_M_S
 
     def covers(self, link: _Link) -> bool:
         """Return whether an observation is inside the place that is expected of the next one."""
@@ -317,10 +411,11 @@ class _ActorChain:
         `misalignment`.
 
         It is the logistic function of a weighted sum of these terms: the share of its points at
-        places that were seen free; the share of static points among all points around it; the share
-        by which its observations align better than shifted along its path; the logarithm of their
-        number; and whether it is a scan line. The second and the third term reject pieces of rails,
-        fences and hedges: these have static neighbours, and align as well after any shift.
+        places that were seen free; the share of static points among all points around it, which
+        counts less the better the path is known; the share by which its observations align better
+        than shifted along its path; the logarithm of their number; and whether it is a scan line.
+        The second and the third term reject pieces of rails, fences and hedges: these have static
+        neighbours, and align as well after any shift.
         """
         _, best, *shifted = misalignment(
             samples, positions, headings, seconds, (0.0, -_SHIFT_M, _SHIFT_M)
@@ -329,15 +424,17 @@ class _ActorChain:
             [(len(link.segment.members), link.freed, link.around) for link in self.links]
         )
         points, freed, around = counts.sum(axis=0).tolist()
-        gain = 1.0 - best / max(min(shifted), 1e-3)
+        gain, is_line = 1.0 - best / max(min(shifted), 1e-3), self._is_scan_line()
+        # who walks along a wall has static neighbours, and aligns at one place only
+        aside = 1.0 if is_line else float(np.clip(1.0 - _EXCUSED * gain, 0.0, 1.0))
         support = float(np.log(min(len(self.links), _MANY_OBSERVATIONS) / _OBSERVATIONS))
         terms = (
             1.0,
             freed / points,
-            around / (points + around),
+            aside * around / (points + around),
             gain,
             support,
-            float(self._is_scan_line()),
+            float(is_line),
         )
         return 1.0 / (
             1.0
@@ -391,6 +488,23 @@ def _is_small(size: FloatArray) -> bool:
     return float(np.hypot(size[0], size[1])) < _PERSON_M[0] and float(size[2]) < _PERSON_M[1]
 
 
+def _split(link: _Link, alive: list[_ActorChain]) -> list[_Link]:
+    """Split a cluster in which several actors are expected that move differently, or that are
+    riders or people: each point belongs to the nearest of the points that are expected.
+    """
+    inside, models = list[_ActorChain](), list[FloatArray]()
+    for chain in sorted(alive, key=lambda chain: -len(chain.links)):
+        model = chain.expected(link)
+        if model is not None and all(chain.is_apart(other) for other in inside):
+            inside.append(chain)
+            models.append(model)
+    if len(inside) < 2:
+        return [link]
+    of_chain = np.repeat(np.arange(len(models)), [len(model) for model in models])
+    nearest = of_chain[nearest_points(link.segment.points, np.concatenate(models))[0]]
+    return [link.part(nearest == k) for k in np.unique(nearest)]
+
+
 def _join_parts(links: list[_Link], deformable: Collection[int]) -> list[_Link]:
     """Join clusters of one vehicle.
 
@@ -415,13 +529,19 @@ def _join_parts(links: list[_Link], deformable: Collection[int]) -> list[_Link]:
 
 
 def _are_parts(one: _Link, other: _Link, deformable: Collection[int]) -> bool:
-    label = one.segment.label
-    if label != other.segment.label:
+    label, whole = one.segment.label, one.is_whole and other.is_whole
+    if label != other.segment.label or whole:
         return False
     if label in deformable or (not (label and deformable) and one.is_small and other.is_small):
         return False
     samples = [thin(link.segment.points, _SAMPLES) for link in (one, other)]
-    return bool(nearest_points(*samples)[1].min() < _PARTS_M**2)
+    # No ray passes between two parts of one side, however far apart it meets them.
+    ahead = samples[0][0] - one.segment.origin
+    directions = rotation_z(-float(np.arctan2(ahead[1], ahead[0])))[:2, :2]
+    seen = [multiply(points[:, :2] - one.segment.origin[:2], directions.T) for points in samples]
+    angles = [np.arctan2(y, x) for x, y in (places.T for places in seen)]
+    gap = max(a.min() - b.max() for a, b in (angles, angles[::-1]))
+    return bool(gap < _BESIDE_RAD and nearest_points(*samples)[1].min() < _PARTS_M**2)
 
 
 def _link(
@@ -430,16 +550,18 @@ def _link(
     """Continue chains with the clusters of a scan, best pairs first; join further parts to them;
     start new chains with the rest.
     """
-    links = _join_parts(
-        [_Link.of(evidence, index) for index in range(len(evidence.clusters))], deformable
-    )
+    clusters = [_Link.of(evidence, index) for index in range(len(evidence.clusters))]
+    apart = [part.thinned(_KEPT) for link in clusters for part in _split(link, alive)]
+    links = _join_parts(apart, deformable)
     taken = best_pairs(_costs(links, alive) if alive else [])
     extra = {
         i: j
         for i in range(len(links))
         if i not in taken
         for j in set(taken.values())
-        if alive[j].last.segment.label == links[i].segment.label and alive[j].covers(links[i])
+        if alive[j].last.segment.label == links[i].segment.label
+        and not links[i].is_whole
+        and alive[j].covers(links[i])
     }
     for i, j in extra.items():
         main = next(k for k, chain in taken.items() if chain == j)

@@ -40,7 +40,8 @@ from carlasc.storage.files import parse_json
 
 _EXTRAPOLATE_S = 0.5  # a track extends beyond its first and its last segment by this time
 _STATIC_M = 0.5  # the visible part of a static actor may seem to move this far
-LONGEST_M = 30.0  # no actor is longer or wider: a larger one has points of other things
+# No actor is longer, wider or higher: a larger one has points of other things.
+LONGEST_M, _WIDEST_M, _HIGHEST_M = 30.0, 4.0, 5.0
 _SURE = 0.8  # actors with less confidence are doubtful
 _END = 0.02  # share of the points of a scan beyond each end of what it shows
 _ASIDE = 0.1  # weight of an end that is not turned to the sensor
@@ -126,13 +127,18 @@ class Track:
         return self.upper - self.lower
 
     @property
+    def is_possible(self) -> bool:
+        """Whether its body, and what was seen of it, are not too large for one actor."""
+        return is_possible(self.size) and bool(self.extent.size.max() < LONGEST_M)
+
+    @property
     def moves(self) -> bool:
         """Whether the actor moves faster and farther than a static actor may seem to, and is not
         too large for one actor.
         """
         fast = (np.square(self.velocity).sum(axis=1) > MIN_SPEED_M_S**2).any()
         return bool(
-            max(self.size.max(), self.extent.size.max()) < LONGEST_M
+            self.is_possible
             and fast
             and np.ptp(self.world_T_actor[:, :3, 3], axis=0).max() > _STATIC_M
         )
@@ -476,6 +482,14 @@ class MovingActors:
             return cls(tracks, moving, tuple(about["summary"]), tuple(arrays["own"])), str(
                 about["key"]
             )
+
+
+def is_possible(size: Sequence[float] | FloatArray) -> bool:
+    """Return whether one actor may have (3,) this length, width and height, metres; length and
+    width may be exchanged, as where its heading is wrong.
+    """
+    short, long = sorted(size[:2])
+    return bool(long < LONGEST_M and short < _WIDEST_M and size[2] < _HIGHEST_M)
 
 
 def is_doubtful(confidence: float) -> bool:

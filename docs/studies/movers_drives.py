@@ -15,6 +15,8 @@ import numpy as np
 from carlasc_recorders import TownActor, TownDrive
 from carlasc_recorders.town.actors import EGO_ID
 from carlasc_recorders.town.drive import REFERENCE_OFFSET_M, concatenate_scans, scan_snapshot
+from crowded import FRAMES as CROWDED_FRAMES
+from crowded import CrowdedDrive
 from numpy.typing import NDArray
 from railed import RailedDrive
 from street import StreetDrive
@@ -34,7 +36,7 @@ SEEDS = {
     "street": range(261, 266),
     "railed": range(361, 366),
 }
-POINTS = {16: 29_000, 32: 65_000, 64: 130_000}  # rays per scan by channels
+POINTS = {16: 29_000, 32: 65_000, 64: 130_000, 128: 236_000}  # rays per scan by channels
 GRIDS = {"coarse": GridSpec.published(), "0.2 m": GridSpec.published().with_resolution(0.2)}
 VEHICLE = CARLA.id_of("Vehicle")
 MOVES_M_S = 1.0  # faster actors are movers; the voxels of the others are not judged
@@ -84,6 +86,7 @@ KINDS = {
     "town": Kind(_town_without_parked_cars, 91, tuple(range(30, 61, 5)), 3, 40),
     "street": Kind(StreetDrive, 91, (30, 45, 60), 3, 40),
     "railed": Kind(RailedDrive, 91, (30, 45, 60), 3, 40),
+    "crowded": Kind(CrowdedDrive, CROWDED_FRAMES, (20,), 1, 40),
     "parked": Kind(
         _town, 101, tuple(int(f) for f in np.linspace(0, 100, 10)), 10, 60, movers_only=False
     ),
@@ -334,7 +337,7 @@ def _see(name: str, seed: int, grids: Mapping[str, GridSpec]) -> dict[str, NDArr
                 grid.labels,
                 grid.known,
             )
-            arrays[f"{frame} {size} owner"] = _owners(actors, invert(pose), spec)
+            arrays[f"{frame} {size} owner"] = owners(actors, invert(pose), spec)
     return arrays
 
 
@@ -357,7 +360,7 @@ def choose_frames(drive: TownDrive, kind: Kind) -> list[int]:
     return sorted(kind.candidates[int(row)] for row in best)
 
 
-def _owners(actors: list[TownActor], grid_T_world: Transform, spec: GridSpec) -> NDArray[np.uint16]:
+def owners(actors: list[TownActor], grid_T_world: Transform, spec: GridSpec) -> NDArray[np.uint16]:
     """Return the actor that each voxel may belong to; the smaller one where boxes overlap."""
     owner = np.zeros(spec.num_voxels, np.uint16)
     centers = spec.from_axes(spec.centers()).reshape(-1, 3)

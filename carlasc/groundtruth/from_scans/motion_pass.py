@@ -150,7 +150,8 @@ def find_actors(
     found += _estimate(feed, run, [*waiting, *map(_observed, follower.finish())])
     found = [track for track in found if track.instance not in follower.riders]
     tracks += found
-    moving = _untracked(follower.moved, found)
+    # points of what is too large for one actor moved, but not together
+    moving = _untracked(follower.moved, [track for track in found if track.is_possible])
     return MovingActors.of(tracks if boxes else complete_bodies(tracks), moving, follower.own)
 
 

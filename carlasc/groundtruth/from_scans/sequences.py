@@ -39,10 +39,10 @@ from carlasc.groundtruth.inputs import (
 )
 from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.reporting import PoseFacts, Residual
-from carlasc.motion import LONGEST_M, ground_points
+from carlasc.motion import ground_points
 from carlasc.motion.odometry import estimate_poses
 from carlasc.motion.refinement import MIN_SCANS, RefinedPoses
-from carlasc.motion.tracks import FIRST_FOUND, MovingActors, is_doubtful
+from carlasc.motion.tracks import FIRST_FOUND, MovingActors, is_doubtful, is_possible
 from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath
@@ -368,7 +368,7 @@ class ScanSequence(StoredSequence):
                 f"{where}: points near the sensor move with it: they are on the recording vehicle, "
                 "or on a person who walks beside it at exactly its pace, and were left out"
             )
-        wrong = sum(max(actor["size_m"]) >= LONGEST_M for actor in self.actors.summary)
+        wrong = sum(not is_possible(actor["size_m"]) for actor in self.actors.summary)
         if wrong:
             notes.append(
                 f"{where}: {wrong} actors are larger than any vehicle, so their numbers or boxes "
