@@ -404,10 +404,9 @@ class _FrameSteps:
         passed = np.zeros(len(voxels), np.bool_)
         world = transform_points(self.now.world_T_grid, centers_of(self.plan.spec, voxels))
         size_m = float(self.plan.spec.voxel_size[[0, 2]].min())
-        regions = {number: region for region, number in self.regions.actors.items()}
         recent = set(self.merger.recent(self.now, self.window))
         for body in bodies:
-            own = np.flatnonzero(self.regions.of_voxel[voxels] == regions[body.number])
+            own = np.flatnonzero(self.regions.of_voxel[voxels] == body.points.region)
             centers = transform_points(invert(body.world_T_actor), world[own]) * (1, -1, 1)
             for frame in recent & body.casts.keys():
                 passed[own] |= passed_by(*body.casts[frame][:3], centers, size_m)
