@@ -27,7 +27,7 @@ from carlasc.motion.tracks import MovingActors
 
 SEEDS = {kind: movers_drives.SEEDS[kind] for kind in ("town", "street")}
 HINTS = {"flow": FLOW, "free space": EVIDENCE}
-FACES = {"one face": (1, 1), "two faces or more": (2, 4)}
+FACES = {"one": (1, 1), "two or more": (2, 4)}
 _MOST_POINTS = 100  # of vehicles that are left out
 _OWN = 0.9  # share of the points of a track that must be on one vehicle
 _WIDTHS = {kind.length_m: kind.width_m for kind in VEHICLE_KINDS}  # without mirrors
@@ -72,7 +72,7 @@ def main() -> None:
                     for seen, (least, most) in FACES.items():
                         if least <= faces <= most:
                             errors[hint, seen].append(np.abs(size - true))
-        print("| motion by | seen | vehicles | length | width | height |")
+        print("| motion by | sides seen | vehicles | length | width | height |")
         print("|---|---|---:|---:|---:|---:|")
         for (hint, seen), rows in errors.items():
             of_axis = np.array(rows).reshape(-1, 3)
