@@ -27,7 +27,7 @@ from carlasc.core.arrays import (
     LabelArray,
     Uint16Array,
 )
-from carlasc.core.cells import as_pose
+from carlasc.core.cells import as_pose, pose_of, transform
 from carlasc.core.classes import ClassTable
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, invert, moved_back, rotate_vectors, transform_points
@@ -103,18 +103,20 @@ def passed_by(
             farther than it behind the middle.
     """
     passed, first = np.zeros(len(places), np.bool_), 0
-    for end, pose in zip(ends, poses):  # noqa: B905 (compiled)
-        for row in range(first, end):
-            x, y, z = points[row]
-            reach = np.sqrt(np.float64(x * x + y * y + z * z))
-            ray = (pose[:3, 0] * x + pose[:3, 1] * y + pose[:3, 2] * z) / reach
+    rows = np.ascontiguousarray(poses[:, :3]).reshape(-1, 12)
+    for k in range(len(ends)):
+        pose = pose_of(rows, k)
+        ox, oy, oz = pose[3], pose[7], pose[11]
+        for row in range(first, ends[k]):
+            x, y, z = transform(pose, points[row, 0], points[row, 1], points[row, 2])
+            reach = np.sqrt((x - ox) ** 2 + (y - oy) ** 2 + (z - oz) ** 2)
+            ux, uy, uz = (x - ox) / reach, (y - oy) / reach, (z - oz) / reach
             for i in range(len(places)):
-                if not passed[i]:
-                    offset = places[i] - pose[:3, 3]
-                    along = (offset * ray).sum()
-                    beside = (offset * offset).sum() - along * along
-                    passed[i] = 0 < along < reach - size_m and beside < size_m * size_m / 16
-        first = end
+                dx, dy, dz = places[i, 0] - ox, places[i, 1] - oy, places[i, 2] - oz
+                along = dx * ux + dy * uy + dz * uz
+                beside = dx * dx + dy * dy + dz * dz - along * along
+                passed[i] |= 0 < along < reach - size_m and beside < size_m * size_m / 16
+        first = ends[k]
     return passed
 
 
