@@ -112,7 +112,8 @@ class Dataset(_MapStyle):
 
     The history ends at the start of a sequence and at a gap in its frame numbers: earlier grids are
     empty, and their `valid` is False. Frames that lack a requested field are left out. `posterior`,
-    `occupied`, `flags` and `views` need grids made with `carlasc.Voting(keep_evidence=True)`;
+    `occupied` and `views` need grids made with `carlasc.Voting(keep_evidence=True)`; `flags` needs
+    these or grids from scans whose actors were completed;
     `instances` and `voxel_flow` need grids made with `keep_actors=True`. Points outside the range
     `min_range_m` to `max_range_m` of carlasc.json are left out. Arrays have the axes of the
     sequences, unless `axes` is set.

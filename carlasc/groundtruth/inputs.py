@@ -108,6 +108,17 @@ class GridPlan:
         return self.voting.keep_evidence or self.voting.min_confidence > 0
 
     @property
+    def infers(self) -> bool:
+        """Whether voxels that no scan saw may be completed, which the field `flags` marks."""
+        observe = self.observe
+        return (
+            isinstance(observe, FromScans)
+            and self.rule == "ray"
+            and observe.dynamic != "tube"
+            and observe.complete != "seen"
+        )
+
+    @property
     def needs_all(self) -> bool:
         """Whether a frame may depend on other frames than those that vote on it: for the motion of
         actors, or the poses of cameras.
@@ -117,7 +128,8 @@ class GridPlan:
     def fields(self) -> tuple[str, ...]:
         """Return the names of the grid's fields."""
         votes = ("votes",) if self.voting.keep else ()
-        evidence = layout.EVIDENCE_FIELDS if self.voting.keep_evidence else ()
+        flags = ("flags",) if self.infers else ()
+        evidence = layout.EVIDENCE_FIELDS if self.voting.keep_evidence else flags
         actors = layout.ACTOR_FIELDS if self.voting.keep_actors else ()
         seen = ("seen",) if self.voting.keep_seen else ()
         return tuple(
@@ -139,6 +151,7 @@ class FrameData:
         actors: the actor of each voxel; None unless the plan needs it.
         boxes: (V, 6) uint8 boxes around the points in each voxel; None unless the plan keeps the
             cameras that see each voxel.
+        flags: (X, Y, Z) uint8 flags of each voxel (`VoxelFlag`); None if nothing can be inferred.
     """
 
     fields: Mapping[str, AnyArray]
@@ -147,6 +160,7 @@ class FrameData:
     evidence: VoxelCertainty | None = None
     actors: VoxelActors | None = None
     boxes: Uint8Array | None = None
+    flags: Uint8Array | None = None
 
 
 class FrameInput(ABC):

@@ -448,6 +448,8 @@ class FrameTask:
             parts["votes"] = data.votes.to_sparse()
         if voting.keep_evidence and evidence is not None:
             parts |= {part: getattr(evidence, part) for part in layout.EVIDENCE_FIELDS}
+        elif plan.infers and data.flags is not None:
+            parts["flags"] = data.flags
         if voting.keep_actors and data.actors is not None:
             actors = data.actors.within(labels > 0)  # confidence may have made voxels unknown
             parts |= {part: getattr(actors, part) for part in layout.ACTOR_FIELDS}

@@ -282,7 +282,7 @@ def surface_of(points: FloatArray) -> Float32Array:
 
 def _share(value: float, limits: tuple[float, float]) -> float:
     """Return how far a value is from the first limit to the second one: 0 to 1."""
-    return float(np.clip((value - limits[0]) / (limits[1] - limits[0]), 0.0, 1.0))
+    return float(np.interp(value, limits, (0.0, 1.0)))
 
 
 def _without_neighbours(extent: Extent) -> Extent:
@@ -291,12 +291,11 @@ def _without_neighbours(extent: Extent) -> Extent:
     """
     length, wide, height = extent.size.tolist()
     large = max(_share(length, _LORRY_LONG_M), _share(height, _LORRY_HIGH_M))
-    cars, larger = _WIDEST_M
-    widest = cars + (large if extent.known[LENGTH] else 1.0) * (larger - cars)
+    widest = np.interp(large if extent.known[LENGTH] else 1.0, (0.0, 1.0), _WIDEST_M)
     if wide <= widest:
         return extent
-    usual = _CAR[WIDTH] + large * (_LORRY[WIDTH] - _CAR[WIDTH])
-    width = widest - _share(wide - widest, (0.0, _CUT_M)) * (widest - usual)
+    usual = np.interp(large, (0.0, 1.0), (_CAR[WIDTH], _LORRY[WIDTH]))
+    width = np.interp(wide, (widest, widest + _CUT_M), (widest, usual))
     lower, upper = extent.lower.copy(), extent.upper.copy()
     if extent.seen_from[WIDTH] < 0:
         upper[WIDTH] = lower[WIDTH] + width
@@ -308,12 +307,9 @@ def _without_neighbours(extent: Extent) -> Extent:
 def _table(extent: Extent, axis: int) -> float:
     """Return the usual length or width of an actor whose other size is known."""
     other, height = float(extent.size[1 - axis]), float(extent.size[2])
-    usual = _TWO_WHEELS[axis]
-    usual += _share(other, _FOUR_WHEELS_M[axis]) * (
-        _CAR[axis] + _share(height, _VAN_HIGH_M) * (_VAN[axis] - _CAR[axis]) - usual
-    )
-    lorry = _share(other, (_LORRY_WIDE_M, _LORRY_LONG_M)[axis])
-    return usual + lorry * (_LORRY[axis] - usual)
+    usual = float(np.interp(height, _VAN_HIGH_M, (_CAR[axis], _VAN[axis])))
+    limits = *_FOUR_WHEELS_M[axis], *(_LORRY_WIDE_M, _LORRY_LONG_M)[axis]
+    return float(np.interp(other, limits, (_TWO_WHEELS[axis], usual, usual, _LORRY[axis])))
 
 
 def usual_shell(lower: FloatArray, upper: FloatArray, extent: Extent) -> Float32Array:
@@ -335,8 +331,7 @@ def usual_shell(lower: FloatArray, upper: FloatArray, extent: Extent) -> Float32
     lower, upper = lower + _INSET_M, upper - _INSET_M
     if width < _ACTORS_WIDE_M or height < _LOWEST_M or not any(extent.known):
         return np.empty((0, 3), np.float32)
-    limits = _LORRY_LONG_M, _LORRY_WIDE_M, _LORRY_HIGH_M
-    box = max(map(_share, (length, width, height), limits))
+    box = max(map(_share, (length, width, height), (_LORRY_LONG_M, _LORRY_WIDE_M, _LORRY_HIGH_M)))
     belt = (1 - box) * (lower[2] + _BELT * height) + box * upper[2]
     body = _box_surface(lower + (0, 0, _CLEARANCE_M), np.array([upper[0], upper[1], belt]))
     if box == 1:

@@ -188,6 +188,21 @@ class TestBodies:
         label, count, flags = at(self.make(tmp_path / "seen", beyond=beyond), roof)
         assert (label, count > 0) == (0, True) and VoxelFlag.INFERRED not in flags
 
+    def test_nothing_is_completed_where_rays_pass_through_the_middle_of_a_voxel(self, tmp_path):
+        rng = np.random.default_rng(3)
+        aims = rng.uniform(-1, 1, (60, 3)) * (self.HALF + 0.2) + (0.0, 4.0, 0.0)
+        ends = [tuple(2.5 * aim) for aim in aims]
+        merged = self.make(tmp_path / "passed", beyond=[(end, BUILDING) for end in ends])
+        flags = merged.evidence.flags.reshape(-1)
+        completed = (flags & VoxelFlag.INFERRED > 0) & (merged.grid.labels.reshape(-1) > 0)
+        size = np.asarray(SPEC.voxel_size)
+        samples = np.array(ends)[:, None] * np.linspace(0.01, 0.9, 2000)[:, None]
+        places = (samples.reshape(-1, 3) - SPEC.lower) / size
+        inner = np.abs(places % 1 - 0.5).max(axis=1) < 0.14  # in a ball of a quarter of a voxel
+        passed = SPEC.flat_index(samples.reshape(-1, 3)[inner])
+        assert completed.sum() > 50
+        assert not completed[passed[passed >= 0]].any()
+
     def test_the_space_above_a_roof_over_which_rays_passed_is_free_and_marked(self, tmp_path):
         over = np.array([0.3, 4.1, 1.3])  # just above the body
         beyond = [(tuple((1 + 0.1 * i) * 2 * over), BUILDING) for i in range(10)]

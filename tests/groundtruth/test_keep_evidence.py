@@ -51,9 +51,11 @@ def known_evidence(monkeypatch):
     )
 
 
-def run(drive, **settings):
+def run(drive, *, observe=None, overwrite=False, **settings):
+    observe = FromScans() if observe is None else observe
+    voting, workers = Voting(**settings), Run(workers=1)
     return carlasc.regrid(
-        drive, SPEC, observe=FromScans(), voting=Voting(**settings), run=Run(workers=1)
+        drive, SPEC, observe=observe, voting=voting, run=workers, overwrite=overwrite
     )
 
 
@@ -67,7 +69,7 @@ def the_sequence(drive):
 def test_evidence_is_written_beside_the_grid_also_of_one_that_is_there(drive):
     run(drive)
     names = {path.suffixes[0] for path in (drive / GRID).glob("0*")}
-    assert names == {".label", ".bin"}
+    assert names == {".label", ".bin", ".flags"}
     before = the_sequence(drive).grid("evaluation_8x8x4", 1)
     result = run(drive, keep_evidence=True)
     assert (result.made, result.failures) == (3, ())
@@ -91,8 +93,8 @@ def test_evidence_is_written_beside_the_grid_also_of_one_that_is_there(drive):
 def test_the_report_says_how_much_was_inferred(drive):
     run(drive)
     report = drive / "cartesian" / layout.report_file("evaluation_8x8x4")
-    assert json.loads(report.read_text())["inferred_share"] is None
-    run(drive, keep_evidence=True)
+    assert json.loads(report.read_text())["inferred_share"] == 0
+    run(drive, keep_evidence=True, overwrite=True)
     assert json.loads(report.read_text())["inferred_share"] == 1
 
 

@@ -1,5 +1,7 @@
 """What moves in a sequence: found in one pass, kept beside the grids, and used again."""
 
+import json
+
 import numpy as np
 import pytest
 from helpers.datasets.captures import read_tree
@@ -7,6 +9,7 @@ from helpers.scenes import passing_car
 
 import carlasc
 from carlasc import FromScans, Run
+from carlasc.core.grids import VoxelFlag
 from carlasc.errors import FormatError
 from carlasc.groundtruth.from_scans import sequences
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
@@ -222,6 +225,22 @@ class TestPass:
             MovingActors.from_bytes(kept, "")[0],
             MovingActors.from_bytes(kept_in(street).read_bytes(), "")[0],
         )
+
+    def test_what_was_completed_is_marked_and_can_be_left_out(self, street):
+        made, seen = (run(street, how, (5, 6), complete=how) for how in ("body", "seen"))
+        assert "000005.flags.bin" in made and "000005.flags.bin" not in seen
+        counts = np.frombuffer(made["000005.bin"], "<f4")
+        is_inferred = np.frombuffer(made["000005.flags.bin"], np.uint8) & VoxelFlag.INFERRED > 0
+        assert is_inferred.any() and (counts[is_inferred] > 0).all()
+        assert not np.frombuffer(seen["000005.bin"], "<f4")[is_inferred].any()
+        whole, sure = (
+            carlasc.Dataset(street, grid="body", fields=("known",), inferred=inferred)[0]["known"]
+            for inferred in (True, False)
+        )
+        assert np.array_equal(whole.reshape(-1), counts > 0)
+        assert np.array_equal(sure.reshape(-1), (counts > 0) & ~is_inferred)
+        report = json.loads((street / "cartesian/body" / layout.REPORT).read_bytes())
+        assert report["inferred_share"] == pytest.approx(is_inferred.sum() / (counts > 0).sum())
 
     def test_a_grid_does_not_depend_on_the_frames_of_the_run(self, street):
         assert run(street, "alone", (5, 6))["000005.label"] == run(street, "all")["000005.label"]

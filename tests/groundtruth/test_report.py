@@ -16,6 +16,7 @@ from helpers.scenes.box_actors import MovingBox, scan_of
 import carlasc
 from carlasc import Grid, GridSpec, Run
 from carlasc.core.frames import FrameRange
+from carlasc.core.grids import VoxelFlag
 from carlasc.core.tables import CARLA
 from carlasc.errors import FormatError
 from carlasc.groundtruth import FromGrid, FromScans, Voting, regrid
@@ -79,7 +80,9 @@ def test_a_report_says_what_the_grids_hold(made):
     assert coverage.votes[0] == (counts == 1).sum()
     assert coverage.votes[2] == ((counts >= 4) & (counts < 8)).sum()
     assert sum(coverage.votes) == coverage.known
-    assert report.inferred_share is None
+    flags = [sequence.read(f"{GRID}/flags", frame) for frame in range(FRAMES)]
+    inferred = np.concatenate([values & VoxelFlag.INFERRED > 0 for values in flags])
+    assert report.inferred_share == inferred.sum() / coverage.known > 0
     assert report.holdout is None
 
 
@@ -93,7 +96,8 @@ def test_a_report_lists_the_actor_that_moves_and_how_well_it_is_tracked(made):
 
 def test_digests_are_those_of_the_published_files(made):
     report = report_in(made)
-    assert {f"{GRID}/labels", f"{GRID}/counts", "points", "labels", "flow"} == set(report.digests)
+    of_grid = {f"{GRID}/{part}" for part in ("labels", "counts", "flags")}
+    assert {*of_grid, "points", "labels", "flow"} == set(report.digests)
     (folder,) = made.rglob("cartesian")
     for name, digests in report.digests.items():
         for row, frame in enumerate(report.frames):

@@ -22,11 +22,18 @@ from carlasc.core.arrays import (
 )
 from carlasc.core.cells import as_pose, count_points, joined
 from carlasc.core.classes import ClassTable
-from carlasc.core.geometry import Transform
+from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.groundtruth.from_scans.actor_voxels import find_voxels
 from carlasc.groundtruth.from_scans.feed import ScanFeed
-from carlasc.groundtruth.from_scans.merging import STATIC, BodyRegions, Instant, Merger
+from carlasc.groundtruth.from_scans.merging import (
+    STATIC,
+    BodyRegions,
+    Instant,
+    Merger,
+    SeenBody,
+    passed_by,
+)
 from carlasc.groundtruth.inputs import FrameData, GridPlan
 from carlasc.groundtruth.voting.ballot import Ballot, ClassPoints, Observation, SeenClass, Votes
 from carlasc.groundtruth.voting.certainty import (
@@ -40,7 +47,7 @@ from carlasc.groundtruth.voting.certainty import (
     matter_of,
     probability,
 )
-from carlasc.groundtruth.voxel_actors import VoxelActors
+from carlasc.groundtruth.voxel_actors import VoxelActors, centers_of
 from carlasc.motion.tracks import MovingActors
 
 # The volume that is inside of any recording vehicle: metres around the sensor.
@@ -120,11 +127,11 @@ def merge_frame(
         bodies = list(merger.bodies(now, window, regions, mirror=True))
         mirrored = steps.vote(body.points for body in bodies)
         space.add_bodies(bodies, now, mirrored.free)
-        completed.append(steps.complete(made, mirrored.votes(copy=False)))
+        completed.append(steps.complete(made, mirrored.votes(copy=False), bodies))
         if options.complete == "body":
             del mirrored
             shells = steps.vote(merger.shells(now, regions))
-            completed.append(steps.complete(made, shells.votes(copy=False)))
+            completed.append(steps.complete(made, shells.votes(copy=False), bodies))
 
     # After completion: an inferred body must not stand where the recording vehicle drove.
     if options.own_path and options.dynamic != "tube":
@@ -142,22 +149,18 @@ def merge_frame(
         made.labels[classes.have_role(made.labels, "ground")] = classes.geometry_id
     size = plan.spec.size
     grid = Grid(plan.spec, made.labels.reshape(size), made.counts.reshape(size))
-    if made.occupied is None:
-        return FrameData({}, grid, votes, None, who, votes.boxes)
     inferred = np.concatenate([above, *(voxels for voxels, _ in completed)])
-    flags, shares = (
-        steps.flags(inferred, contested, seen_now),
-        _join_shares(votes, consensus, completed, classes),
-    )
+    flags = steps.flags(inferred, contested, seen_now).reshape(size)
+    if made.occupied is None:
+        return FrameData({}, grid, votes, None, who, votes.boxes, flags)
+    shares = _join_shares(votes, consensus, completed, classes)
     views = space.count("views", now, window)
     views[steps.in_body] = 0  # rays of other times
     np.maximum.at(views, votes.occupied["voxel"], votes.occupied["voters"])
     np.maximum(views, made.counts > 0, out=views)  # free space is summed over smaller cells
     views_of_voxels = views.astype(np.uint16).reshape(size)
-    evidence = VoxelCertainty(
-        made.occupied.reshape(size), shares, flags.reshape(size), views_of_voxels
-    )
-    return FrameData({}, grid, votes, evidence, who, votes.boxes)
+    evidence = VoxelCertainty(made.occupied.reshape(size), shares, flags, views_of_voxels)
+    return FrameData({}, grid, votes, evidence, who, votes.boxes, flags)
 
 
 def _join_shares(
@@ -354,20 +357,28 @@ class _FrameSteps:
         )
         return evidence.voxels[(evidence.counts > 0) & unsure]
 
-    def complete(self, made: _UnfinishedGrid, votes: Votes) -> tuple[IntArray, AnyArray]:
+    def complete(
+        self, made: _UnfinishedGrid, votes: Votes, bodies: Iterable[SeenBody]
+    ) -> tuple[IntArray, AnyArray]:
         """Complete unknown voxels of bodies by votes; return these voxels and their votes.
 
-        Voxels with free votes stay unknown.
+        Voxels with free votes stay unknown, and those through which rays passed at this time.
+
+        Args:
+            made: the grid.
+            votes: the votes.
+            bodies: what scans saw of each body, as mirror images.
         """
         inferred = self._evidence(votes, *votes.elect_occupied(), np.flatnonzero(self.in_body))
         # A mirrored side is less certain than a seen one, and has its own calibration.
         inferred.matter[inferred.matter == Matter.BODY] = Matter.MIRRORED
         unseen = np.isin(inferred.voxels, self.regions.hidden_ends) & (inferred.hits == 0)
-        unseen |= np.isin(inferred.voxels, made.passed)
+        unseen |= np.isin(inferred.voxels, made.passed) | np.isin(inferred.voxels, self.returned[0])
         inferred = inferred.at(
             (made.counts[inferred.voxels] == 0) & (inferred.counts > 0) & ~unseen
         )
         is_there = self._decide(inferred) > 0
+        is_there[is_there] = ~self._passed(bodies, inferred.voxels[is_there])
         # Rays passed through these mirrored voxels: the surfaces of the next step do not fill them.
         made.passed = inferred.voxels[~is_there]
         inferred = inferred.at(is_there)
@@ -375,6 +386,21 @@ class _FrameSteps:
         made.counts[inferred.voxels] = inferred.counts
         made.set_probability(inferred.voxels, self._probability(inferred))
         return inferred.voxels, votes.occupied[np.isin(votes.occupied["voxel"], inferred.voxels)]
+
+    def _passed(self, bodies: Iterable[SeenBody], voxels: IntArray) -> BoolArray:
+        """Return (N,) bool: the voxels of bodies, flat indices, through whose middle rays of the
+        frame or of its neighbours passed.
+        """
+        passed = np.zeros(len(voxels), np.bool_)
+        world = transform_points(self.now.world_T_grid, centers_of(self.plan.spec, voxels))
+        size_m = float(self.plan.spec.voxel_size[[0, 2]].min())
+        recent = set(self.merger.recent(self.now, self.window))
+        for body in bodies:
+            own = np.flatnonzero(self.regions.of_voxel[voxels] == body.points.region)
+            centers = transform_points(invert(body.world_T_actor), world[own]) * (1, -1, 1)
+            for frame in recent & body.casts.keys():
+                passed[own] |= passed_by(*body.casts[frame][:3], centers, size_m)
+        return passed
 
     def actors(self, labels: AnyIntArray) -> VoxelActors | None:
         """Return the actors in the voxels of (V,) classes; None unless the plan needs them."""

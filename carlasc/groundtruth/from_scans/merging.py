@@ -27,8 +27,9 @@ from carlasc.core.arrays import (
     LabelArray,
     Uint16Array,
 )
-from carlasc.core.cells import as_pose
+from carlasc.core.cells import as_pose, pose_of, transform
 from carlasc.core.classes import ClassTable
+from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, invert, moved_back, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import RaysFromPlace, lengths, runs_of_origins
@@ -85,6 +86,38 @@ class Cast(NamedTuple):
     map_T_places: FloatArray
     lower: FloatArray
     upper: FloatArray
+
+
+@cached
+def passed_by(
+    points: Float32Array, ends: IntArray, poses: FloatArray, places: FloatArray, size_m: float
+) -> BoolArray:
+    """Return (M,) bool: which places rays pass through.
+
+    Args:
+        points: (N, 3) as in `Cast`.
+        ends: (K,) as in `Cast`.
+        poses: (K, 4, 4) of the origins, as in `Cast`.
+        places: (M, 3) metres, frame of the map.
+        size_m: size of a place. A ray passes nearer than a quarter of it to the middle, and ends
+            farther than it behind the middle.
+    """
+    passed, first = np.zeros(len(places), np.bool_), 0
+    rows = np.ascontiguousarray(poses[:, :3]).reshape(-1, 12)
+    for k in range(len(ends)):
+        pose = pose_of(rows, k)
+        ox, oy, oz = pose[3], pose[7], pose[11]
+        for row in range(first, ends[k]):
+            x, y, z = transform(pose, points[row, 0], points[row, 1], points[row, 2])
+            reach = np.sqrt((x - ox) ** 2 + (y - oy) ** 2 + (z - oz) ** 2)
+            ux, uy, uz = (x - ox) / reach, (y - oy) / reach, (z - oz) / reach
+            for i in range(len(places)):
+                dx, dy, dz = places[i, 0] - ox, places[i, 1] - oy, places[i, 2] - oz
+                along = dx * ux + dy * uy + dz * uz
+                beside = dx * dx + dy * dy + dz * dz - along * along
+                passed[i] |= 0 < along < reach - size_m and beside < size_m * size_m / 16
+        first = ends[k]
+    return passed
 
 
 @dataclass(frozen=True)
