@@ -242,34 +242,33 @@ def numbered(cells: IntArray) -> tuple[IntArray, IntArray]:
 
 def count_points(
     points: AnyFloatArray,
-    grid_T_points: Transform,
+    grid_T_points: FloatArray,
     spec: GridSpec,
-    counts: Int32Array | None = None,
 ) -> Int32Array:
-    """Return the number of points per voxel, (V,).
+    """Return the number of points per voxel, (V,), which are in several places.
 
     Same result as with `GridSpec.flat_index`, with less memory.
 
     Args:
         points: (N, 3) metres.
-        grid_T_points: (4, 4), from the frame of the points to the frame of the grid.
+        grid_T_points: (K, 4, 4), from the frame of the points to that of the grid, for each place.
         spec: geometry of the grid.
-        counts: (V,) existing counts, to which the points are added in place; None starts with
-            zeros.
     """
-    counts = np.zeros(spec.num_voxels, np.int32) if counts is None else counts
-    _count(np.ascontiguousarray(points), as_pose(grid_T_points), Cells.of(spec), counts)
+    counts, poses = np.zeros(spec.num_voxels, np.int32), grid_T_points[:, :3].reshape(-1, 12)
+    _count(np.ascontiguousarray(points), poses, Cells.of(spec), counts)
     return counts
 
 
 @cached
-def _count(points: AnyFloatArray, pose: Pose, cells: Cells, counts: Int32Array) -> None:
-    for i in range(len(points)):
-        point = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        x, y, z = transform(pose, point[0], point[1], point[2])
-        voxel = find_voxel(x, y, z, cells)
-        if voxel < len(counts):
-            counts[voxel] += 1
+def _count(points: AnyFloatArray, poses: FloatArray, cells: Cells, counts: Int32Array) -> None:
+    for place in range(len(poses)):
+        pose = pose_of(poses, place)
+        for i in range(len(points)):
+            point = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+            x, y, z = transform(pose, point[0], point[1], point[2])
+            voxel = find_voxel(x, y, z, cells)
+            if voxel < len(counts):
+                counts[voxel] += 1
 
 
 @cached

@@ -14,7 +14,14 @@ from typing import Any, Self
 
 import numpy as np
 
-from carlasc.core.arrays import AnyIntArray, FloatArray, Int32Array, LabelArray, Uint8Array
+from carlasc.core.arrays import (
+    AnyIntArray,
+    BoolArray,
+    FloatArray,
+    Int32Array,
+    LabelArray,
+    Uint8Array,
+)
 from carlasc.errors import ArgumentError, FormatError, check_types, first_names, within
 
 Color = tuple[int, int, int]
@@ -209,6 +216,17 @@ class ClassTable:
         for index, color in self.colors.items():
             palette[index] = color
         return palette
+
+    def have_role(self, labels: AnyIntArray, role: str) -> BoolArray:
+        """Return which labels are of a class with a role, one of `ROLES`: (..., ) bool.
+
+        Args:
+            labels: (...) ids below `num_channels`.
+            role: the role.
+        """
+        has_role = np.zeros(self.num_channels, np.bool_)
+        has_role[[*getattr(self, role)]] = True
+        return has_role[labels]
 
     def id_of(self, name: str) -> int:
         """Return the id of a class by its name, case-insensitive.

@@ -23,11 +23,9 @@ _FACE_POINTS, _FACE_SHARE = (
 )
 _FACE_SINE = 0.26  # a scan sees a face if its rays meet the face at 15 degrees or more
 _ALIKE = 0.15  # actors are similar if their known sizes differ by this fraction
-# no vehicle is shorter, or narrower, than these shares of the usual size of its kind
-_SHORTEST = (
-    0.6,
-    0.85,
-)
+# No vehicle is shorter, or narrower, than these shares of the usual size of its kind; from the
+# second share on, all of it was seen.
+_SHORTEST = (0.5, 0.7), (0.8, 0.9)
 _HIGHER = 1.6  # the height may grow by less than this factor
 _EXAMPLES = 3  # a size is learned from at least so many actors, and a shape from at most so many
 # cells of surfaces, and cells in which surfaces of several actors are compared
@@ -35,8 +33,10 @@ _CELL_M, _BIN_M = (
     0.1,
     0.2,
 )
-_ACTORS_WIDE_M, _ACTORS_LONG_M = 1.3, 2.6  # narrower or shorter vehicles have two wheels
-_WIDEST_M = 2.4, 2.8  # of cars, and of longer vehicles: wider ones have points of a neighbour
+_ACTORS_WIDE_M = 1.3  # narrower vehicles have two wheels
+# Of cars, and of longer or higher vehicles: wider ones have points of a neighbour, or are smeared.
+# They are cut to the usual width, gradually over this width.
+_WIDEST_M, _CUT_M = (2.1, 2.6), 0.3
 _LOWEST_M = 1.0  # of lower ones, only a part was seen
 
 BODY_MARGIN_M = 0.1  # margin of the box of an actor around its body
@@ -50,7 +50,11 @@ _BELT, _CABIN, _CABIN_WIDE = 0.62, (0.08, 0.75), 0.85
 LENGTH, WIDTH = 0, 1
 # Length and width, metres, of vehicles with two wheels, cars, vans, and lorries and buses.
 _TWO_WHEELS, _CAR, _VAN, _LORRY = (1.8, 0.7), (4.4, 1.85), (5.4, 2.0), (7.5, 2.5)
-_LORRY_WIDE_M, _LORRY_HIGH_M, _LORRY_LONG_M, _LORRY_TOP_M, _VAN_HIGH_M = 2.25, 2.3, 6.0, 2.8, 1.95
+# Nothing changes in a step: sizes and shapes change gradually between two limits. From vehicles
+# with two wheels to cars, by width and by length; from cars to vans, by height; to lorries, by
+# width, height and length.
+_FOUR_WHEELS_M, _VAN_HIGH_M = ((1.0, 1.4), (2.3, 2.9)), (1.7, 2.0)
+_LORRY_WIDE_M, _LORRY_HIGH_M, _LORRY_LONG_M, _LORRY_TOP_M = (2.05, 2.4), (2.0, 2.6), (5.6, 6.8), 2.8
 
 
 @dataclass(frozen=True)
@@ -92,8 +96,8 @@ class Extent:
         height; smaller ones are of a part of it.
         """
         length, width = (
-            bool(self.size[axis] > share * _table(self, axis))
-            for axis, share in enumerate(_SHORTEST)
+            bool(self.size[axis] > sum(shares) / 2 * _table(self, axis))
+            for axis, shares in enumerate(_SHORTEST)
         )
         return length, width
 
@@ -174,13 +178,14 @@ class Sizes:
         """
         extent = _without_neighbours(extent)
         lower, upper = extent.lower.copy(), extent.upper.copy()
-        known, plausible = extent.known, extent.plausible
+        known = extent.known
         if not any(known):  # too few points, or too far away
             return lower, upper
         for axis in (LENGTH, WIDTH):
-            if known[axis] and plausible[axis]:
-                continue
-            missing = max(self._expected(label, extent, axis) - (upper[axis] - lower[axis]), 0.0)
+            expected, seen = self._expected(label, extent, axis), extent.size[axis]
+            missing = max(expected - seen, 0.0)
+            if known[axis]:
+                missing *= 1 - _share(seen / _table(extent, axis), _SHORTEST[axis])
             # What is missing is behind the actor, as the sensor sees it: the near end was seen.
             if extent.seen_from[axis] < 0:
                 upper[axis] += missing
@@ -190,8 +195,8 @@ class Sizes:
         if not extent.exemplary:
             lower[2] -= max(self._height(label, upper - lower) - (upper[2] - lower[2]), 0.0)
         # the top of a lorry may be above the highest ray
-        if upper[LENGTH] - lower[LENGTH] > _LORRY_LONG_M:
-            upper[2] = max(upper[2], lower[2] + _LORRY_TOP_M)
+        is_long = _share(upper[LENGTH] - lower[LENGTH], _LORRY_LONG_M)
+        upper[2] += is_long * max(lower[2] + _LORRY_TOP_M - upper[2], 0.0)
         return lower, upper
 
     def _expected(self, label: int, extent: Extent, axis: int) -> float:
@@ -275,14 +280,23 @@ def surface_of(points: FloatArray) -> Float32Array:
     return (cells[count > 1] * _CELL_M).astype(np.float32)
 
 
+def _share(value: float, limits: tuple[float, float]) -> float:
+    """Return how far a value is from the first limit to the second one: 0 to 1."""
+    return float(np.clip((value - limits[0]) / (limits[1] - limits[0]), 0.0, 1.0))
+
+
 def _without_neighbours(extent: Extent) -> Extent:
     """Return the extent, cut to the greatest width of a vehicle of its length; the side towards the
     sensor stays.
     """
     length, wide, height = extent.size.tolist()
-    if wide <= _WIDEST_M[length > _LORRY_LONG_M or not extent.known[LENGTH]]:
+    large = max(_share(length, _LORRY_LONG_M), _share(height, _LORRY_HIGH_M))
+    cars, larger = _WIDEST_M
+    widest = cars + (large if extent.known[LENGTH] else 1.0) * (larger - cars)
+    if wide <= widest:
         return extent
-    width = (_LORRY if length > _LORRY_LONG_M or height > _LORRY_HIGH_M else _CAR)[WIDTH]
+    usual = _CAR[WIDTH] + large * (_LORRY[WIDTH] - _CAR[WIDTH])
+    width = widest - _share(wide - widest, (0.0, _CUT_M)) * (widest - usual)
     lower, upper = extent.lower.copy(), extent.upper.copy()
     if extent.seen_from[WIDTH] < 0:
         upper[WIDTH] = lower[WIDTH] + width
@@ -293,12 +307,13 @@ def _without_neighbours(extent: Extent) -> Extent:
 
 def _table(extent: Extent, axis: int) -> float:
     """Return the usual length or width of an actor whose other size is known."""
-    length, width, height = extent.size.tolist()
-    if width > _LORRY_WIDE_M if axis == LENGTH else length > _LORRY_LONG_M:
-        return _LORRY[axis]
-    if width > _ACTORS_WIDE_M if axis == LENGTH else length > _ACTORS_LONG_M:
-        return (_VAN if height > _VAN_HIGH_M else _CAR)[axis]
-    return _TWO_WHEELS[axis]
+    other, height = float(extent.size[1 - axis]), float(extent.size[2])
+    usual = _TWO_WHEELS[axis]
+    usual += _share(other, _FOUR_WHEELS_M[axis]) * (
+        _CAR[axis] + _share(height, _VAN_HIGH_M) * (_VAN[axis] - _CAR[axis]) - usual
+    )
+    lorry = _share(other, (_LORRY_WIDE_M, _LORRY_LONG_M)[axis])
+    return usual + lorry * (_LORRY[axis] - usual)
 
 
 def usual_shell(lower: FloatArray, upper: FloatArray, extent: Extent) -> Float32Array:
@@ -320,10 +335,12 @@ def usual_shell(lower: FloatArray, upper: FloatArray, extent: Extent) -> Float32
     lower, upper = lower + _INSET_M, upper - _INSET_M
     if width < _ACTORS_WIDE_M or height < _LOWEST_M or not any(extent.known):
         return np.empty((0, 3), np.float32)
-    if width > _LORRY_WIDE_M or height > _LORRY_HIGH_M or length > _LORRY_LONG_M:
-        return _box_surface(lower + (0, 0, _CLEARANCE_M), upper)
-    belt = lower[2] + _BELT * height
+    limits = _LORRY_LONG_M, _LORRY_WIDE_M, _LORRY_HIGH_M
+    box = max(map(_share, (length, width, height), limits))
+    belt = (1 - box) * (lower[2] + _BELT * height) + box * upper[2]
     body = _box_surface(lower + (0, 0, _CLEARANCE_M), np.array([upper[0], upper[1], belt]))
+    if box == 1:
+        return body
     inset = (1 - _CABIN_WIDE) / 2 * width
     cabin = _box_surface(
         np.array([lower[0] + _CABIN[0] * length, lower[1] + inset, belt]),

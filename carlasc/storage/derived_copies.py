@@ -30,6 +30,7 @@ from carlasc.storage.files import (
     AnyPath,
     has_content,
     make_folder,
+    remove,
     remove_stale_of,
     replaced,
     sync_all,
@@ -40,7 +41,6 @@ from carlasc.storage.files import (
 from carlasc.storage.folder import FolderSequence, FolderSink, FolderSource
 from carlasc.storage.inputs import combined, sequence_states
 from carlasc.storage.layout import Metadata
-from carlasc.storage.packed.output import remove
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 from carlasc.storage.shares import Share
 from carlasc.storage.transport.trees import is_url

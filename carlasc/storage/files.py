@@ -185,6 +185,40 @@ def temporary_folder(beside: Path) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+@contextmanager
+def writing_folder(out: Path) -> Iterator[Path]:
+    """Yield a temporary folder, which is renamed at the end of the block, and removed if the block
+    fails.
+
+    An existing folder is replaced at the end of the block: check before that it may be.
+
+    Raises:
+        StorageError: a file cannot be written; names it as it would be called in `out`. Nothing is
+            left behind.
+    """
+    out = out.resolve()  # "." has no name
+    part, old = (out.with_name(f".{out.name}.{ending}") for ending in ("part", "old"))
+    try:
+        with writing(out):
+            remove(part)  # left by a killed run
+            make_folder(part)
+            yield part
+            sync_tree(part)
+            if out.exists():
+                remove(old)
+                out.rename(old)
+            part.rename(out)
+            sync_all([out.parent])
+            remove(old)
+    except StorageError as error:
+        error.where = error.where.replace(str(part), str(out))
+        raise
+    finally:
+        remove(part)
+        if old.exists() and not out.exists():
+            old.rename(out)
+
+
 def check_target(out: Path, endings: tuple[str, ...], overwrite: bool) -> None:
     """Check that a file can be written: its ending, and that its path is free.
 
@@ -247,6 +281,15 @@ def writing(place: AnyPath) -> Iterator[None]:
         yield
     except OSError as error:
         raise storage_error(Path(error.filename or place), error) from error
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[Path]:
+    """Name a file in an OSError: those of writes name none."""
+    try:
+        yield path
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def storage_error(path: AnyPath, error: OSError) -> StorageError:
@@ -428,6 +471,15 @@ def remove_file(path: Path) -> None:
     sync_all([path.parent])
 
 
+def remove(path: Path) -> None:
+    """Remove a file or a folder, if it exists, and wait until the removal is on the disk."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+        sync_all([path.parent])
+    else:
+        remove_file(path)
+
+
 def make_folder(folder: Path) -> None:
     """Create a folder and its parents, unless they exist, and wait until the new names are on the
     disk.
@@ -443,16 +495,15 @@ def _sync_path(path: Path) -> None:
     windows = os.name == "nt"  # syncs files that are open for writing, and no folders
     if windows and path.is_dir():
         return
-    try:
+    with naming(path):
         descriptor = os.open(path, os.O_RDWR if windows else os.O_RDONLY)
         try:
             _sync(descriptor)
+        except OSError as error:  # such as some network shares
+            if not (error.errno in _UNSUPPORTED and path.is_dir()):
+                raise
         finally:
             os.close(descriptor)
-    except OSError as error:
-        if error.errno in _UNSUPPORTED and path.is_dir():
-            return  # such as some network shares
-        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 if sys.platform == "darwin":

@@ -10,7 +10,7 @@ import html
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.resources import files
@@ -24,12 +24,10 @@ from carlasc.storage.files import (
     AnyPath,
     check_target,
     make_folder,
-    sync_all,
-    sync_tree,
+    naming,
     write_output,
-    writing,
+    writing_folder,
 )
-from carlasc.storage.packed.output import remove
 from carlasc.viewing.actor_lines import Trails
 from carlasc.viewing.page.contents import PageContent, Scores, open_content, pack_arrays
 from carlasc.viewing.recordings.content import MAX_POINTS, RecordingWriter, record_frames
@@ -261,8 +259,10 @@ def _write_folder(content: PageContent, progress: Progress, out: Path) -> None:
     with writing_folder(out) as folder:
         make_folder(folder / _FRAMES)
         for number, block in enumerate(_blocks(content, scores, progress)):
-            (folder / _FRAMES / f"{number:06d}.bin").write_bytes(block)
-        (folder / "index.html").write_bytes(b"".join(_compose(content, scores, None)))
+            with naming(folder / _FRAMES / f"{number:06d}.bin") as path:
+                path.write_bytes(block)
+        with naming(folder / "index.html") as path:
+            path.write_bytes(b"".join(_compose(content, scores, None)))
 
 
 def _blocks(content: PageContent, scores: list[Scores], progress: Progress) -> Iterator[bytes]:
@@ -340,33 +340,3 @@ def check_folder(out: Path, overwrite: bool) -> None:
             problem="the page exists",
             advice="choose another name, or replace it with `overwrite=True`",
         )
-
-
-@contextmanager
-def writing_folder(out: Path) -> Iterator[Path]:
-    """Yield a temporary folder, which is renamed at the end of the block, and removed if the block
-    fails.
-
-    An existing folder is replaced at the end of the block. Call `check_folder` before.
-
-    Raises:
-        StorageError: the folder cannot be written; nothing is left behind.
-    """
-    out = out.resolve()  # "." has no name
-    part, old = (out.with_name(f".{out.name}.{ending}") for ending in ("part", "old"))
-    try:
-        with writing(out):
-            remove(part)  # left by a killed run
-            make_folder(part)
-            yield part
-            sync_tree(part)
-            if out.exists():
-                remove(old)
-                out.rename(old)
-            part.rename(out)
-            sync_all([out.parent])
-            remove(old)
-    finally:
-        remove(part)
-        if old.exists() and not out.exists():
-            old.rename(out)

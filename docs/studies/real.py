@@ -10,7 +10,7 @@ without any label, and measured by `real_measures.py`. Nothing is left on the di
 Without labels, the actors that free space shows are compared with the boxes too: recall is the
 share of the points in boxes of moving actors that move by `carlasc label --from motion`, false
 motion the share of those in boxes of parked ones. People without boxes walk there, so precision
-cannot be measured.
+cannot be measured. At last, maps are made: see `real_maps.py`.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import numpy as np
 import study
 from numpy.typing import NDArray
 from real_drive import find_poses, label_points, read_boxes, read_scans, write_drive
+from real_maps import rows
 from real_measures import GROW_M, Judge, Measures, Share
 
 import carlasc
@@ -94,6 +95,9 @@ def main() -> None:
         print("|---|---:|---:|---:|---:|")
         for line in bodies_of(judge, drives[False], frames):
             print(line)
+        print()
+        for line in rows(read_scans(given.archive), judge, given.work):
+            print(line, flush=True)
 
 
 def bodies_of(judge: Judge, folder: Path, frames: list[int]) -> Iterator[str]:

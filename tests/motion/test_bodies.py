@@ -135,7 +135,7 @@ def test_a_length_that_no_vehicle_of_this_width_has_is_completed_although_its_si
 @pytest.mark.parametrize(
     ("seen", "size"),
     [
-        (extent((0.5, 0.6, 1.7), REAR), (1.8, 0.6, 1.7)),  # a cyclist
+        (extent((0.5, 0.64, 1.7), REAR), (1.8, 0.64, 1.7)),  # a cyclist
         (extent((1.8, 0.3, 1.7), LOW, (0.0, -20.0)), (1.8, 0.7, 1.7)),
         (extent((1.0, 2.5, 3.2), REAR), (7.5, 2.5, 3.2)),  # a lorry, by its width
         (extent((1.0, 2.0, 2.6), REAR), (5.4, 2.0, 2.6)),  # a van, by its height
@@ -155,6 +155,29 @@ def test_a_length_that_no_vehicle_of_this_width_has_is_completed_although_its_si
 def test_usual_sizes_are_those_of_two_wheelers_cars_and_lorries(seen, size):
     lower, upper = Sizes([]).complete(CAR, seen)
     assert np.allclose(upper - lower, size)
+
+
+@pytest.mark.parametrize(
+    "faces", [REAR, LOW, (True, False, True, False), EVERY_SIDE], ids=["rear", "side", "two", "all"]
+)
+@pytest.mark.parametrize("size", [(1.0, 2.0, 1.6), (3.9, 2.26, 1.76), (5.9, 2.3, 2.2)])
+def test_a_size_that_grows_by_a_centimetre_changes_the_body_by_centimetres(faces, size):
+    for axis, sizes in enumerate(((0.5, 7.0), (0.5, 3.2), (0.5, 3.2))):
+        found = []
+        for value in np.arange(*sizes, 0.01):
+            seen = extent([*size[:axis], value, *size[axis + 1 :]], faces)
+            found.append(np.concatenate(Sizes([]).complete(CAR, seen)))
+        assert np.abs(np.diff(found, axis=0)).max() < 0.25
+
+
+def test_the_shape_of_a_car_becomes_that_of_a_lorry_without_a_step():
+    tops = []
+    for width in np.arange(1.9, 2.6, 0.01):
+        half = np.array((4.4, width, 1.9)) / 2
+        shell = usual_shell(-half, half, extent(2 * half, REAR))
+        tops.append(shell[shell[:, 0] > half[0] - 0.3, 2].max())  # of its front
+    assert (np.diff(tops) > -1e-6).all() and np.diff(tops).max() < 0.05
+    assert tops[-1] - tops[0] == pytest.approx(0.38 * 1.9 - 0.44, abs=0.01)
 
 
 class TestUsualShell:

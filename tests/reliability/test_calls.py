@@ -16,9 +16,9 @@ pytestmark = pytest.mark.skipif(
 def test_a_failing_call_of_any_command_leaves_whole_files_and_the_next_run_finishes_them(
     tmp_path: Path,
 ) -> None:
-    outcome = calls.run(120, 0, tmp_path)
+    outcome = calls.run(80, 0, tmp_path)
     assert outcome.found == []
-    assert outcome.tried == 120
+    assert outcome.tried == 80
 
 
 def test_calls_are_counted_made_to_fail_and_recorded(tmp_path: Path) -> None:

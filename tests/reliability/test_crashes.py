@@ -26,9 +26,9 @@ def test_a_power_failure_at_any_call_of_a_download_loses_nothing(tmp_path: Path)
 @needs_compiler
 @pytest.mark.slow
 def test_after_a_power_failure_of_any_command_the_next_run_finishes(tmp_path: Path) -> None:
-    outcome = crashes.run(120, 0, tmp_path)
+    outcome = crashes.run(80, 0, tmp_path)
     assert outcome.found == []
-    assert outcome.tried == 120
+    assert outcome.tried == 80
 
 
 @needs_compiler

@@ -28,9 +28,9 @@ def test_what_a_killed_run_began_the_next_run_finishes_with_the_same_bytes(tmp_p
 def test_what_a_killed_run_of_any_command_began_the_next_run_finishes_with_the_same_bytes(
     tmp_path: Path,
 ) -> None:
-    outcome = in_fresh_process(kills.run, 40, 0, tmp_path)
+    outcome = in_fresh_process(kills.run, 32, 0, tmp_path)
     assert outcome.found == []
-    assert outcome.tried >= 40
+    assert outcome.tried >= 32
 
 
 def test_every_command_that_writes_is_killed_and_changed() -> None:

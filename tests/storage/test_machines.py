@@ -110,7 +110,7 @@ def test_a_store_has_what_a_model_in_memory_has_after_kills_and_resumed_runs(end
 def test_a_store_has_what_a_model_in_memory_has_after_many_kills_and_resumed_runs(
     ending: str,
 ) -> None:
-    run(ending, 150)
+    run(ending, 100)
 
 
 class ForgetfulWriter(FolderWriter):

@@ -74,8 +74,8 @@ def find_voxels(
         labels: (V,) classes of the grid, with ground classes.
     """
     classes, instance = feed.classes, np.zeros(spec.num_voxels, np.uint32)
-    solid = (labels > 0) & ~np.isin(labels, sorted(classes.ground))
-    movable = solid & np.isin(labels, sorted(classes.movable)) if feed.has_labels else solid
+    solid = (labels > 0) & ~classes.have_role(labels, "ground")
+    movable = solid & classes.have_role(labels, "movable") if feed.has_labels else solid
     voxels, velocities = [np.empty(0, np.int64)], [np.empty((0, 3))]
     bodies = np.flatnonzero((regions.of_voxel != STATIC) & solid)
     centers = transform_points(now.world_T_grid, centers_of(spec, bodies))

@@ -218,8 +218,7 @@ class ScanFeed:
         )
         on_ground = [_labels(scan)[ground_points(scan.points)] for scan in scans]
         others = sum(
-            int(np.count_nonzero(~np.isin(labels, sorted(self.classes.ground))))
-            for labels in on_ground
+            int(np.count_nonzero(~self.classes.have_role(labels, "ground"))) for labels in on_ground
         )
         return self.has_labels and others <= _OTHERWISE * sum(map(len, on_ground))
 
@@ -382,7 +381,7 @@ class ScanFeed:
         with self._lock:
             if frame not in self._scans:
                 scan = self._voting_points(frame)
-                moving = np.isin(_labels(scan), sorted(self.classes.moving))
+                moving = self.classes.have_role(_labels(scan), "moving")
                 if "flow" in self.motion and scan.flow is not None:
                     moving |= is_fast(scan.flow, self.options.motion.min_speed_m_s)
                 self._scans[frame] = PreparedScan.of(
@@ -437,7 +436,7 @@ class ScanFeed:
         """
         if scan.labels is None or not (self.trusts_ground_labels or self.must_find_ground):
             return None
-        return np.isin(scan.labels, sorted(self.classes.ground))
+        return self.classes.have_role(scan.labels, "ground")
 
     def ground(self, scan: PreparedScan) -> BoolArray:
         """Return (N,) bool: the points of a scan on the ground."""

@@ -12,23 +12,23 @@ from numpy.typing import NDArray
 
 from carlasc.core.arrays import (
     AnyArray,
-    AnyFloatArray,
     AnyIntArray,
     BoolArray,
     Float32Array,
+    FloatArray,
     Int32Array,
     IntArray,
     LabelArray,
     Uint8Array,
 )
-from carlasc.core.cells import count_points, joined
+from carlasc.core.cells import as_pose, count_points, joined
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.groundtruth.from_scans.actor_voxels import find_voxels
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import STATIC, BodyRegions, Instant, Merger
 from carlasc.groundtruth.inputs import FrameData, GridPlan
-from carlasc.groundtruth.voting.ballot import Ballot, Observation, SeenClass, Votes
+from carlasc.groundtruth.voting.ballot import Ballot, ClassPoints, Observation, SeenClass, Votes
 from carlasc.groundtruth.voting.certainty import (
     UNKNOWN,
     ClassConsensus,
@@ -139,7 +139,7 @@ def merge_frame(
         above = steps.free_above(made)
     who = steps.actors(made.labels)
     if feed.must_find_ground:  # ground that was found had a class for the votes only
-        made.labels[np.isin(made.labels, sorted(classes.ground))] = classes.geometry_id
+        made.labels[classes.have_role(made.labels, "ground")] = classes.geometry_id
     size = plan.spec.size
     grid = Grid(plan.spec, made.labels.reshape(size), made.counts.reshape(size))
     if made.occupied is None:
@@ -305,6 +305,17 @@ class _FrameSteps:
         return self.regions.of_voxel != STATIC
 
     @cached_property
+    def others(self) -> list[int]:
+        """The other frames of the window."""
+        return [frame for frame in self.window if frame != self.now.frame]
+
+    @cached_property
+    def grid_T_others(self) -> FloatArray:
+        """(K, 4, 4) poses of the sensor at the other frames."""
+        poses = [self.now.grid_T_world @ self.feed.pose(frame) for frame in self.others]
+        return np.array(poses).reshape(-1, 4, 4)
+
+    @cached_property
     def returned(self) -> tuple[IntArray, Int32Array]:
         """The voxels with points of the frame's own scan, increasing, and their numbers of points;
         none if the scan is not merged.
@@ -312,7 +323,9 @@ class _FrameSteps:
         return self._returned(slice(None if self.now.frame in self.window else 0))
 
     def _returned(self, chosen: BoolArray | slice) -> tuple[IntArray, Int32Array]:
-        counts = self._count(self.merger.settled(self.now.frame).points[chosen], self.now.frame)
+        points, now = self.merger.settled(self.now.frame).points[chosen], self.now
+        grid_T_sensor = now.grid_T_world @ self.feed.pose(now.frame)
+        counts = count_points(points, grid_T_sensor[None], self.plan.spec)
         voxels = np.flatnonzero(counts)
         return voxels, counts[voxels]
 
@@ -438,21 +451,11 @@ class _FrameSteps:
         """Return the voxels outside of bodies that moving points are in at other times."""
         if self.feed.options.dynamic != "align":
             return _NO_VOXELS
-        passing = np.zeros(self.plan.spec.num_voxels, np.int32)
-        for other in self.window:
-            if other != self.now.frame:
-                self._count(self.merger.moving(other), other, passing)
-        return np.flatnonzero((passing > 0) & ~self.in_body)
-
-    def _count(
-        self, points: AnyFloatArray, frame: int, counts: Int32Array | None = None
-    ) -> Int32Array:
-        """Return the number of points in each voxel: (N, 3) metres, frame of a scan.
-
-        They are added to (V,) existing counts.
-        """
-        grid_T_sensor = self.now.grid_T_world @ self.feed.pose(frame)
-        return count_points(points, grid_T_sensor, self.plan.spec, counts)
+        voters = [
+            ClassPoints(np.ascontiguousarray(self.merger.moving(frame).T), as_pose(pose))
+            for frame, pose in zip(self.others, self.grid_T_others, strict=True)
+        ]
+        return np.flatnonzero(self.vote([SeenClass(1, voters)]).hit & ~self.in_body)
 
     def keep_returns(self, made: _UnfinishedGrid, votes: Votes, consensus: ClassConsensus) -> None:
         """Make voxels with returns of the frame's own scan occupied, unless the returns are
@@ -480,9 +483,9 @@ class _FrameSteps:
     def free_above(self, made: _UnfinishedGrid) -> IntArray:
         """Make unknown voxels above vehicles and people free; return them."""
         classes, solid = self.feed.classes, made.labels > 0
-        bodies = solid & self.in_body & ~np.isin(made.labels, sorted(classes.ground))
+        bodies = solid & self.in_body & ~classes.have_role(made.labels, "ground")
         if self.feed.has_labels:
-            bodies |= np.isin(made.labels, sorted(classes.movable))
+            bodies |= classes.have_role(made.labels, "movable")
         voxels = find_above(solid, made.counts > 0, bodies, self.plan.spec)
         made.counts[voxels] = 1
         made.set_probability(voxels, _ABOVE_PROBABILITY)
@@ -496,11 +499,8 @@ class _FrameSteps:
         apart = float(self.plan.spec.voxel_size[[0, 2]].min()) / 2
         axes = [np.arange(a, b + 1e-9, apart) for a, b in zip(_OWN_LOWER, _OWN_UPPER, strict=True)]
         body = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
-        path = np.zeros(self.plan.spec.num_voxels, np.int32)
-        for other in self.window:
-            if other != self.now.frame:
-                self._count(body, other, path)
+        path = count_points(body, self.grid_T_others, self.plan.spec)
         voxels = np.flatnonzero((path > 0) & (made.labels > 0))
-        solid = ~np.isin(made.labels[voxels], sorted(self.feed.classes.ground))
+        solid = ~self.feed.classes.have_role(made.labels[voxels], "ground")
         is_there_now = self.in_body[voxels] | np.isin(voxels, self.returned[0])
         return voxels[solid & ~is_there_now]

@@ -16,8 +16,15 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from carlasc.core.arrays import Float32Array, FloatArray, Int32Array, IntArray, Uint32Array
-from carlasc.core.cells import Cells, Pose, Triple, as_pose, pose_of, transform
+from carlasc.core.arrays import (
+    AnyArray,
+    Float32Array,
+    FloatArray,
+    Int32Array,
+    IntArray,
+    Uint32Array,
+)
+from carlasc.core.cells import Cells, Pose, Real, Triple, as_pose, pose_of, transform
 from carlasc.core.compiling import cached, inlined, jit
 from carlasc.core.geometry import Transform, invert
 from carlasc.core.grids import GridSpec
@@ -28,10 +35,12 @@ from carlasc.groundtruth.voting.rays import DROPPED, clip, empty_rays, view_from
 
 _BITS = 3  # a block has 2 ** _BITS cells along each edge
 _EDGE = 1 << _BITS
+_CELLS = _EDGE**3  # of a block
 # About the height of a cell, as most rays graze the ground, and its width in the map of an actor.
 # With wider ones, pedestrians lose: see docs/studies/rays.md.
 _CELL_M = 0.05
 _MOST = 8  # greatest number of cells along an edge of a voxel, as in those of 0.4 m; least: 2
+_MANY = 4096  # samples that are found before their cells change: they fit into the L1 cache
 _FEWEST = 256  # least number of blocks by which a map grows
 Counted = Literal["samples", "scans", "last"]
 """What cells count: samples, or scans; or they keep the last scan, which takes no removal."""
@@ -115,8 +124,8 @@ class _Blocks(NamedTuple):
         slots: (X, Y, Z) index of each block in `counts`; -1 without one.
         unused: (U,) indices; the first ones are of blocks that are not in use.
         left: (1,) how many of them there are.
-        counts: (B, cells) samples or scans in each cell, or the last scan.
-        stamps: (B, cells) the last scan that was added or removed, if scans are counted.
+        counts: (B * cells,) samples or scans in each cell, or the last scan.
+        stamps: (B * cells,) the last scan that was added or removed, if scans are counted.
     """
 
     first: IntArray
@@ -156,7 +165,7 @@ class FreeMap:
     def _clear(self) -> None:
         self._held.clear()
         slots, unused = np.empty((0, 0, 0), np.int32), np.empty(0, np.int32)
-        counts, stamps = (np.empty((0, _EDGE**3), np.int32) for _ in range(2))
+        counts, stamps = (np.empty(0, np.int32) for _ in range(2))
         origin, left = np.zeros(3, np.int64), np.zeros(1, np.int64)
         self._blocks = _Blocks(origin, slots, unused, left, counts, stamps)
 
@@ -220,10 +229,10 @@ class FreeMap:
 
     def _grow(self) -> None:
         """Make room for more blocks."""
-        old, size = self._blocks, len(self._blocks.counts)
+        old, size = self._blocks, len(self._blocks.counts) // _CELLS
         more = max(size // 4, _FEWEST)
         for cells in (old.counts, old.stamps) if self._counted == "scans" else (old.counts,):
-            cells.resize((size + more, _EDGE**3), refcheck=False)  # without a copy
+            cells.resize((size + more) * _CELLS, refcheck=False)  # without a copy
         # the lowest ones are taken first, from the end: memory that was used before
         unused = np.concatenate([np.arange(size + more - 1, size - 1, -1), old.unused])
         old.left[0] += more
@@ -241,7 +250,7 @@ class FreeMap:
         high = np.maximum(np.minimum(last, old.first + old.slots.shape), low)
         kept = old.slots[tuple(map(slice, low - old.first, high - old.first))]
         slots[tuple(map(slice, low - first, high - first))] = kept
-        is_unused = np.ones(len(old.counts), np.bool_)
+        is_unused = np.ones(len(old.counts) // _CELLS, np.bool_)
         is_unused[kept[kept >= 0]] = False
         unused = np.flatnonzero(is_unused)[::-1].astype(np.int32)
         left = np.array([len(unused)])
@@ -297,8 +306,9 @@ def _trace(
     # the same cells change, and their counts return to what they were. Samples near the edge of a
     # cell need no exact rule therefore, unlike those of the kernel.
     _, slots, unused, left, counts, stamps = blocks
-    views, sign, stamp = len(stamps) > 0, change[0], change[1]
-    block_x, block_y, block_z = begin[0], begin[1], begin[2]
+    # unsigned: Numba need not look for negative indices
+    block_x, block_y, block_z = np.uint64(begin[0]), np.uint64(begin[1]), np.uint64(begin[2])
+    bits, places, used = np.uint64(_BITS), np.empty(_MANY, np.uint64), 0
     rays, labels = empty_rays(BLOCK), np.ones(BLOCK, np.uint16)
     top_x, top_y, top_z = region.size[0] - 1.0, region.size[1] - 1.0, region.size[2] - 1.0
     for place in range(len(ends)):
@@ -313,35 +323,57 @@ def _trace(
                     continue
                 # Each sample may need a block. A ray is added whole, so that it can begin again.
                 if left[0] <= last - step:
+                    _change(places[:used], change, counts, stamps)
                     return ray + i
                 while step <= last:
                     # clipped, as rounding may put samples beyond the region
-                    cell_x = int(min(max(x - step * dx, 0.0), top_x))
-                    cell_y = int(min(max(y - step * dy, 0.0), top_y))
-                    cell_z = int(min(max(z - step * dz, 0.0), top_z))
+                    cell_x = np.uint64(min(max(x - step * dx, 0.0), top_x))
+                    cell_y = np.uint64(min(max(y - step * dy, 0.0), top_y))
+                    cell_z = np.uint64(min(max(z - step * dz, 0.0), top_z))
                     step += 1.0
-                    a = (cell_x >> _BITS) + block_x
-                    b = (cell_y >> _BITS) + block_y
-                    c = (cell_z >> _BITS) + block_z
+                    a = (cell_x >> bits) + block_x
+                    b = (cell_y >> bits) + block_y
+                    c = (cell_z >> bits) + block_z
                     slot = slots[a, b, c]
                     if slot < 0:
                         left[0] -= 1
                         slot = slots[a, b, c] = unused[left[0]]
-                    cell = _in_block(cell_x, cell_y, cell_z)
-                    if views:
-                        if stamps[slot, cell] == stamp:
-                            continue
-                        stamps[slot, cell] = stamp
-                    counts[slot, cell] = counts[slot, cell] + sign if sign else stamp
+                    if used == _MANY:
+                        _change(places, change, counts, stamps)
+                        used = 0
+                    places[used] = np.uint64(slot * _CELLS) + _in_block(cell_x, cell_y, cell_z)
+                    used += 1
             ray += count
+    _change(places[:used], change, counts, stamps)
     return ray
 
 
+@jit
+def _change(
+    places: AnyArray, change: tuple[int, int], counts: Int32Array, stamps: Int32Array
+) -> None:
+    """Change the cells of samples."""
+    # A loop of its own: the processor waits for many cells at once, as they are far from each other
+    # in memory.
+    sign, stamp = change
+    if len(stamps):
+        for place in places:
+            if stamps[place] != stamp:
+                stamps[place] = stamp
+                counts[place] += sign
+    elif sign:
+        for place in places:
+            counts[place] += sign
+    else:
+        for place in places:
+            counts[place] = stamp
+
+
 @inlined
-def _in_block(x: int, y: int, z: int) -> int:
+def _in_block(x: Real, y: Real, z: Real) -> Real:
     """Return the index of a cell in its block."""
-    last = _EDGE - 1
-    return ((((x & last) << _BITS) + (y & last)) << _BITS) + (z & last)
+    last, bits = np.uint64(_EDGE - 1), np.uint64(_BITS)
+    return ((((x & last) << bits) + (y & last)) << bits) + (z & last)
 
 
 @inlined
@@ -357,7 +389,7 @@ def _add_column(
     least: int,
     slots: Int32Array,
     counts: Int32Array,
-    column: IntArray,
+    column: Int32Array,
 ) -> None:
     """Add the counts of the cells at `start + k * stride`, in cells from the first one, to
     `column[k]`, if they are at least `least`.
@@ -373,14 +405,16 @@ def _add_column(
         number = int(more) + 1
         a, b, end = i >> _BITS, j >> _BITS, min(low + number, end_z << _BITS)
         if 0 <= a < end_x and 0 <= b < end_y:
-            cell = _in_block(i, j, 0)
+            cell = _in_block(np.uint64(i), np.uint64(j), np.uint64(0))
             begin = max(low, 0)
             while begin < end:
                 slot, above = slots[a, b, begin >> _BITS], min((begin | (_EDGE - 1)) + 1, end)
                 if slot >= 0:
-                    for other in range(begin, above):
-                        value = counts[slot, cell + (other & (_EDGE - 1))]
-                        column[k + other - low] += value if value >= least else 0
+                    first, into = cell + np.uint64(begin & (_EDGE - 1)), np.uint64(k + begin - low)
+                    first += np.uint64(slot * _CELLS)
+                    for other in range(np.uint64(above - begin)):
+                        value = counts[first + other]
+                        column[into + other] += value if value >= least else 0
                 begin = above
         k += number
 
@@ -410,7 +444,7 @@ def _gather(
     """
     across, along, up = parts
     size, voxel_size, first = cells.size, cells.voxel_size, blocks.first
-    columns, row = np.empty(size[2] * up, np.int64), 0
+    columns, row = np.empty(size[2] * up, np.int32), 0
     rise = voxel_size[2] / up
     stride = pose[2] * rise, pose[6] * rise, pose[10] * rise
     while row < len(found):
@@ -440,7 +474,9 @@ def _gather(
                 start = x - (first[0] << _BITS), y - (first[1] << _BITS), z - (first[2] << _BITS)
                 _add_column(start, stride, least, blocks.slots, blocks.counts, column)
         for k in range(height):
-            total = column[k * up : (k + 1) * up].sum()
+            total = 0
+            for part in range(k * up, (k + 1) * up):
+                total += column[part]
             # rays passed through the voxel: it does not become unknown by rounding
             found[row + k] = max(round(total * weight), 1) if total > 0 else 0
         row += height

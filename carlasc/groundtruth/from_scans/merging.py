@@ -397,7 +397,7 @@ class Merger:
             static[self.actors.moving.get(frame, [])] = False
             # Wheels touch the ground: ground near a body stays static, or each actor would leave a
             # hole in the road.
-            ground = np.isin(scan.labels, sorted(self.classes.ground))
+            ground = self.classes.have_role(scan.labels, "ground")
             for track in self.actors.tracks.values():
                 static[track.members.get(frame, [])] = False
                 lower, upper = track.lower - _AROUND_M, track.upper + _AROUND_M
@@ -428,8 +428,9 @@ class Merger:
         track = self.actors.tracks[number]
         if not track.rigid and abs(self.scan_of(other).seconds - now.seconds) > _DEFORMABLE_S:
             return None
-        kept, scan = self._carried[other], self.scan_of(other)
+        kept = self._carried[other]
         if number not in kept:
+            scan = self.scan_of(other)
             own = np.zeros(len(scan.points), np.bool_)
             own[track.members.get(other, [])] = True
             rays, hits, places = [], [], []
@@ -524,13 +525,14 @@ class BodyRegions:
         for region, (_, track, pose) in enumerate(largest_first, 1):
             actor_T_grid = invert(pose) @ world_T_grid
             turned = np.abs(actor_T_grid[:3, :3])
-            middle = invert(actor_T_grid)[:2, 3]
+            x, y = invert(actor_T_grid)[:2, 3]
             reach = float(np.linalg.norm(np.maximum(-track.lower, track.upper))) + across + up
-            near = np.flatnonzero((np.abs(columns - middle) < reach[:, None]).all(axis=1))
+            is_near = (np.abs(columns[0] - x) < reach) & (np.abs(columns[1] - y) < reach)
+            near = np.flatnonzero(is_near)
             if not len(near):
                 continue
             cells = np.column_stack(
-                [np.repeat(columns[near], len(heights), axis=0), np.tile(heights, len(near))]
+                [*np.repeat(columns[:, near], len(heights), axis=1), np.tile(heights, len(near))]
             )
             slack = (
                 np.repeat(across[near], len(heights))[:, None] * turned[:, :2].sum(axis=1)
@@ -554,17 +556,17 @@ class BodyRegions:
 
 @lru_cache(maxsize=4)
 def _columns_of(spec: GridSpec) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Return the columns of the cells of a grid: x and y of their centres, (C, 2), z of the centres
+    """Return the columns of the cells of a grid: x and y of their centres, (2, C), z of the centres
     in each, and half the extent of the cells, (C,) across and up, all in metres.
     """
     # Cells of a column share x and y: a body is compared with columns first, then with the cells of
     # the few columns near it.
     size = spec.voxel_size
     centers = spec.from_axes(replace(spec, size=(*spec.size[:2], 1)).centers())
-    columns = centers[:, :, 0, :2].reshape(-1, 2).astype(np.float64)
+    columns = centers[:, :, 0, :2].reshape(-1, 2).T.astype(np.float64, order="C")
     heights = spec.lower[2] + (np.arange(spec.size[2]) + 0.5) * size[2]
     is_curved = spec.coordinates == "cylindrical"
-    width = np.hypot(*columns.T) * size[1] if is_curved else np.full(len(columns), size[1])
+    width = np.hypot(*columns) * size[1] if is_curved else np.full(columns.shape[1], size[1])
     return columns, heights, np.maximum(size[0], width) / 2, float(size[2] / 2)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -49,7 +48,7 @@ from carlasc.motion.tracks import MovingActors
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
-from carlasc.storage.files import temporary_folder, to_json, write_atomic, writing
+from carlasc.storage.files import temporary_folder, to_json, write_atomic, writing_folder
 from carlasc.storage.protocol import Source
 
 
@@ -228,20 +227,16 @@ class DriveMap:
         """Write the body of each actor, in its own frame, and its poses; return the number of
         actors.
         """
-        table, made = list[dict[str, Any]](), self.cells.folder / folder.name
-        made.mkdir()
-        for number in sorted({part[0] for part in self.cells.counts} - {STATIC}):
-            about = self._about(number, self.inputs.actors.tracks[number]) | {
-                "file": f"{number:04}{ending}"
-            }
-            text = f"actor {number}, {about['class']}, metres, x forward, y left, z up"
-            write_points(made / about["file"], self._pieces(number, text))
-            table.append(about)
-        write_atomic(made / ACTORS, to_json(table))
-        with writing(folder):
-            if folder.exists():
-                shutil.rmtree(folder)
-            made.rename(folder)
+        table = list[dict[str, Any]]()
+        with writing_folder(folder) as made:
+            for number in sorted({part[0] for part in self.cells.counts} - {STATIC}):
+                about = self._about(number, self.inputs.actors.tracks[number]) | {
+                    "file": f"{number:04}{ending}"
+                }
+                text = f"actor {number}, {about['class']}, metres, x forward, y left, z up"
+                write_points(made / about["file"], self._pieces(number, text))
+                table.append(about)
+            write_atomic(made / ACTORS, to_json(table))
         return len(table)
 
     def _about(self, number: int, track: Track) -> dict[str, Any]:

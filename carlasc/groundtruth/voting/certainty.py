@@ -259,7 +259,7 @@ class _Cast(NamedTuple):
         weight: (M,) float64 votes of each row.
         total: (N,) float64 votes of each voxel.
         rows: (V,) int32 index of each voxel of the grid in `voxels`; -1 without votes.
-        size: (3,) int64 of the grid.
+        size: of the grid.
     """
 
     voxels: Int32Array
@@ -268,7 +268,7 @@ class _Cast(NamedTuple):
     weight: FloatArray
     total: FloatArray
     rows: Int32Array
-    size: IntArray
+    size: tuple[int, int, int]
 
 
 @dataclass(frozen=True)
@@ -315,7 +315,7 @@ def agree(votes: AnyArray, spec: GridSpec, classes: ClassTable) -> ClassConsensu
     )
     weight = votes["sure"] * np.repeat(scans, np.diff(begins))
     total = np.asarray(np.bincount(rows[votes["voxel"]], weight), np.float64)
-    cast = _Cast(voxels, begins, own, weight, total, rows, np.array(spec.size))
+    cast = _Cast(voxels, begins, own, weight, total, rows, spec.size)
 
     # The majority in voxels with many scans stands for the truth there, instead of the iterations
     # of Dawid and Skene. Classes without such voxels get the usual share of errors, spread evenly
@@ -373,15 +373,6 @@ def _cell(cast: _Cast, i: int) -> tuple[int, int, int]:
     return voxel // (size[1] * size[2]), voxel // size[2] % size[1], voxel % size[2]
 
 
-@inlined
-def _row(cast: _Cast, a: int, b: int, c: int) -> int:
-    """Return the index of the voxel of a cell; -1 if it is outside of the grid or has no votes."""
-    size = cast.size
-    if a < 0 or b < 0 or c < 0 or a >= size[0] or b >= size[1] or c >= size[2]:
-        return -1
-    return cast.rows[(a * size[1] + b) * size[2] + c]
-
-
 @cached
 def _compare(cast: _Cast, confusion: FloatArray, frequency: FloatArray) -> None:
     """Count votes in voxels among neighbours of their class: `confusion[a, b]`: votes for b in
@@ -405,12 +396,12 @@ def _compare(cast: _Cast, confusion: FloatArray, frequency: FloatArray) -> None:
 @jit
 def _is_inside(cast: _Cast, i: int, most: IntArray) -> bool:
     """Return whether at least two neighbours of a voxel have votes, all most for its class."""
-    around = 0
-    a, b, c = _cell(cast, i)
-    for x in range(a - 1, a + 2):
-        for y in range(b - 1, b + 2):
-            for z in range(c - 1, c + 2):
-                other = _row(cast, x, y, z)
+    rows, around = cast.rows, 0
+    (a, b, c), (nx, ny, nz) = _cell(cast, i), cast.size
+    for x in range(max(a - 1, 0), min(a + 2, nx)):
+        for y in range(max(b - 1, 0), min(b + 2, ny)):
+            for z in range(max(c - 1, 0), min(c + 2, nz)):
+                other = rows[(x * ny + y) * nz + z]
                 if other >= 0:  # counts the voxel itself too
                     # One neighbour of another class is a border, where the errors of positions look
                     # like errors of labels.
@@ -506,19 +497,24 @@ def _neighbour_prior(
     # the share of each class counts like a tenth of a neighbour: it decides where there is none
     total = 0.1
     prior[:] = 0.1 * frequency
-    a, b, c = _cell(cast, i)
-    for x in range(-_REACH[0], _REACH[0] + 1):
-        for y in range(-_REACH[1], _REACH[1] + 1):
-            for z in range(-_REACH[2], _REACH[2] + 1):
-                other = -1 if x == y == z == 0 else _row(cast, a + x, b + y, c + z)
-                if other >= 0:
-                    votes = cast.total[other]
-                    part = votes / (votes + 2) / (1 + x * x + y * y + 2 * z * z)
+    # Arrays are taken out of the tuple once: Numba counts a reference each time.
+    rows, totals, begins, own = cast.rows, cast.total, cast.begins, cast.own
+    (a, b, c), (nx, ny, nz) = _cell(cast, i), cast.size
+    low, high = max(c - _REACH[2], 0), min(c + _REACH[2] + 1, nz)
+    for x in range(max(a - _REACH[0], 0), min(a + _REACH[0] + 1, nx)):
+        for y in range(max(b - _REACH[1], 0), min(b + _REACH[1] + 1, ny)):
+            column = (x * ny + y) * nz
+            for z in range(low, high):
+                other = rows[column + z]
+                if other >= 0 and other != i:
+                    votes = totals[other]
+                    away = (x - a) * (x - a) + (y - b) * (y - b) + 2 * (z - c) * (z - c)
+                    part = votes / (votes + 2) / (1 + away)
                     if place[other] >= 0:
                         for kind in range(len(prior)):
                             prior[kind] += part * shares[place[other], kind]
                     else:
-                        prior[cast.own[cast.begins[other]]] += part
+                        prior[own[begins[other]]] += part
                     total += part
     prior /= total
 

@@ -398,10 +398,8 @@ class FrameCounter:
             for a, b in zip(lower, upper, strict=True)
         ]
         lattice = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
-        counts = np.zeros(spec.num_voxels, np.int32)
-        for pose in poses:
-            count_points(lattice, grid_T_world @ pose, spec, counts)
-        return np.flatnonzero(counts)
+        grid_T_actor = np.stack([grid_T_world @ pose for pose in poses])
+        return np.flatnonzero(count_points(lattice, grid_T_actor, spec))
 
 
 def _are_returns(scan: Scan) -> BoolArray:

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import io
 import os
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,11 +14,10 @@ from carlasc.errors import ArgumentError, ConflictError, FormatError, StorageErr
 from carlasc.storage.files import (
     AnyPath,
     make_folder,
-    remove_file,
+    remove,
     rename,
     replaced,
     storage_error,
-    sync_all,
     write_at,
 )
 
@@ -209,12 +207,3 @@ class DeferredErrorFile(io.RawIOBase):
                     os.close(self._descriptor)
             except OSError as error:  # network file systems may report failed writes here
                 self._error = self._error or error
-
-
-def remove(path: Path) -> None:
-    """Remove a file or a folder, if it exists, and wait until the removal is on the disk."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-        sync_all([path.parent])
-    else:
-        remove_file(path)

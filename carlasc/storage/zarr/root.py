@@ -8,8 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from carlasc.errors import ArgumentError, ConflictError, StorageError
-from carlasc.storage.files import parse_json, rename, replaced, to_json
-from carlasc.storage.packed.output import remove
+from carlasc.storage.files import parse_json, remove, rename, replaced, to_json
 from carlasc.storage.packed.stores import STORE, VERSION, PackOptions
 from carlasc.storage.transport.trees import LocalTarget, Target
 from carlasc.storage.zarr.shards import METADATA, group_metadata

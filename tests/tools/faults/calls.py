@@ -221,11 +221,17 @@ def _said(code: int, messages: str, path: str | None, case: Path) -> list[str]:
 
 def _names(line: str, path: str, case: Path) -> bool:
     """Whether a message names a file, by the name that it gets when it is whole, or the folder or
-    store that it is in.
+    store that it is in, unless a temporary folder takes its place at once.
     """
     relative = Path(path).relative_to(case).as_posix()
-    final = re.sub(r"\.([^/]+)\.[^./]+-[0-9]+\.[0-9a-f]{8}\.part(?=/|$)", r"\1", relative)
-    names = {final, *(parent.as_posix() for parent in Path(final).parents if parent != Path())}
+    final = re.sub(r"\.([^/]+?)(?:\.[^./]+-[0-9]+\.[0-9a-f]{8})?\.part(?=/|$)", r"\1", relative)
+    if final == ".":  # all files are in it
+        return True
+    names = {final}
+    if not re.match(r"\.\w+\.part/", relative):
+        names |= {parent.as_posix() for parent in Path(final).parents if parent != Path()}
+    if final != relative and final.startswith("out.ply/"):  # cells of a map, read for its files
+        names.add("out_actors/")
     return any(name.removesuffix(".part").removesuffix(".replaced") in line for name in names)
 
 

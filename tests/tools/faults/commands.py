@@ -180,6 +180,7 @@ EVERY = (
     Command("label-images", "label seen -o out --from images", ("seen",), "out", _PICTURES),
     Command("refine", "refine scene -o out --refine always", ("scene",), "out"),
     Command("map", "map scene out.ply", ("scene",), "out.ply"),
+    Command("map-actors", "map scene out.ply --actors --mesh out.glb", ("scene",), "out_actors"),
     Command("map-bag", "map bag out.ply --force", ("bag",), "out.ply", ("rosbags",)),
     Command(
         "map-grid", "map scene out.ply --grid evaluation_16x16x8 --frames 1", ("scene",), "out.ply"
@@ -348,7 +349,12 @@ TEMPORARY = "tmp"
 """The folder for temporary files, in the folder of a case."""
 
 
-def start(argv: list[str], case: Path, before: Callable[[], None] | None = None) -> int:
+def start(
+    argv: list[str],
+    case: Path,
+    before: Callable[[], None] | None = None,
+    after: Callable[[], None] | None = None,
+) -> int:
     """Run a command in a forked child, in the folder of a case, as the leader of a process group of
     its own.
 
@@ -359,6 +365,7 @@ def start(argv: list[str], case: Path, before: Callable[[], None] | None = None)
         argv: the arguments of `carlasc`.
         case: the folder; `MESSAGES` is written there.
         before: called in the child before the command.
+        after: called in the child after it.
 
     Returns:
         The child's process id.
@@ -377,6 +384,8 @@ def start(argv: list[str], case: Path, before: Callable[[], None] | None = None)
         if before is not None:
             before()
         code = run_here(argv)
+        if after is not None:
+            after()
     except KeyboardInterrupt:
         code = 130  # Ctrl-C before the command had begun
     finally:

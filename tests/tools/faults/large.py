@@ -1,11 +1,13 @@
 """Large data: time and memory per frame, sequence, point and voxel stay flat.
 
 Each case runs a command on data of three sizes, each twice as large as the one before, with one
-worker. From the second doubling on, an item may not cost more than in the first.
+worker. From the second doubling on, an item may not cost more than in the first. At the least
+sizes, calls of functions stand for time: other work on the processor does not change them.
 """
 
 from __future__ import annotations
 
+import cProfile
 import os
 import shutil
 import time
@@ -21,7 +23,8 @@ from faults.commands import MESSAGES, start
 from faults.outcome import Measured, Outcome
 
 _WORSE = 1.5  # times the cost of an item in the first doubling; more is a fault
-_NOISE_S, _NOISE_KB = 0.5, 20_000  # of CPU time and of memory, in each difference
+_NOISE_S, _NOISE_CALLS, _NOISE_KB = 0.5, 50_000, 20_000  # in each difference
+_CALLS = "calls.txt"
 _PARTS = 4  # the smallest size is so many times smaller than the largest
 
 
@@ -157,10 +160,14 @@ def run(count: int, seed: int, folder: Path) -> Outcome:
     began, found, measured = time.monotonic(), list[str](), list[Measured]()
     for large in LARGE:
         size = large.full if count >= 1000 else large.quick if count else large.least
-        costs = [_costs(large, size * part // _PARTS, folder / large.name) for part in (1, 2, 4)]
+        count_calls = size == large.least
+        sizes = [size * part // _PARTS for part in (1, 2, 4)]
+        if count_calls:  # the first run compiles
+            _costs(large, sizes[0], folder / large.name, count_calls)
+        costs = [_costs(large, part, folder / large.name, count_calls) for part in sizes]
         for command, *cost in zip(large.commands, *costs, strict=True):
             name = command.split()[0]
-            found += _judge(f"{name}, {size:,} {large.name}", large, size, *cost)
+            found += _judge(f"{name}, {size:,} {large.name}", large, size, count_calls, *cost)
             seconds, kilobytes = zip(*cost, strict=True)
             measured.append((name, f"{size:,} {large.name}", seconds, kilobytes))
     seconds_in_all = time.monotonic() - began
@@ -168,37 +175,59 @@ def run(count: int, seed: int, folder: Path) -> Outcome:
 
 
 Cost = tuple[float, float]
-"""CPU time, seconds, and the largest memory, kilobytes."""
+"""CPU time, seconds, or calls; and the largest memory, kilobytes."""
 
 
-def _costs(large: Large, size: int, folder: Path) -> list[Cost]:
+def _costs(large: Large, size: int, folder: Path, count_calls: bool) -> list[Cost]:
     """Return the cost of each command on data of a size."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     large.write(folder / "data", size)
     costs = []
     for command in large.commands:
-        child = start(command.replace("{n}", str(size)).split(), folder)
+        argv, profile = command.replace("{n}", str(size)).split(), cProfile.Profile()
+        if count_calls:
+
+            def keep(profile: cProfile.Profile = profile) -> None:
+                profile.disable()
+                calls = sum(entry.callcount for entry in profile.getstats())  # type: ignore[attr-defined]
+                (folder / _CALLS).write_text(str(calls))
+
+            child = start(argv, folder, profile.enable, keep)
+        else:
+            child = start(argv, folder)
         _, status, used = os.wait4(child, 0)
         if status:
             raise RuntimeError(f"{command}: {status}: {(folder / MESSAGES).read_text()[-2000:]}")
-        costs.append((used.ru_utime + used.ru_stime, float(used.ru_maxrss)))
+        work = (
+            float((folder / _CALLS).read_text()) if count_calls else used.ru_utime + used.ru_stime
+        )
+        costs.append((work, float(used.ru_maxrss)))
     shutil.rmtree(folder)
     return costs
 
 
-def _judge(name: str, large: Large, size: int, small: Cost, middle: Cost, whole: Cost) -> list[str]:
-    found = []
+def _judge(
+    name: str,
+    large: Large,
+    size: int,
+    count_calls: bool,
+    small: Cost,
+    middle: Cost,
+    whole: Cost,
+) -> list[str]:
+    found, unit = [], "calls" if count_calls else "s of CPU"
+    noise = _NOISE_CALLS if count_calls else _NOISE_S
     # voxels grow by the square of the size, everything else by the size
     factor = 4 if "voxels" in large.name else 2
     first, second = middle[0] - small[0], whole[0] - middle[0]
-    if second > _WORSE * factor * max(first, 0) + _NOISE_S * factor:
-        found.append(f"{name}: {small[0]:.1f}, {middle[0]:.1f}, {whole[0]:.1f} s of CPU")
+    if second > _WORSE * factor * max(first, 0) + noise * factor:
+        found.append(f"{name}: {small[0]:,.1f}, {middle[0]:,.1f}, {whole[0]:,.1f} {unit}")
     grown = whole[1] - middle[1]
     if grown > large.kilobytes * size / 2 + _NOISE_KB:
         found.append(f"{name}: {middle[1] / 1e3:.0f} MB, then {whole[1] / 1e3:.0f} MB")
     print(
-        f"{name}: {small[0]:.1f}, {middle[0]:.1f}, {whole[0]:.1f} s; "
+        f"{name}: {small[0]:,.1f}, {middle[0]:,.1f}, {whole[0]:,.1f} {unit}; "
         f"{small[1] / 1e3:.0f}, {middle[1] / 1e3:.0f}, {whole[1] / 1e3:.0f} MB",
         flush=True,
     )
