@@ -51,7 +51,6 @@ _IN_A_ROW = 4  # the same, if all scans on one side in time, from the farthest i
 # Every third scan is looked up first. A place that so many scans saw occupied, and none saw free,
 # is static.
 _EVERY, _SURE = 3, 4
-_MIXED = 2  # a static place was occupied in more than so many times the scans that saw it free
 _CELL_M = 0.35  # points of one object are in neighbouring cells of this size, seen from above
 _MIN_POINTS = 3  # smaller clusters are noise
 _JUDGED_CELL_M = 0.15  # one point per cell of this size is looked up, and decides for the others
@@ -339,7 +338,7 @@ def _judge(
     in_a_row = np.bitwise_count(free & ~smeared).max(axis=0)
     moved = (seen_through >= _AGREEING) & (seen_through > occupied)
     left = ~moved & (in_a_row >= _IN_A_ROW)
-    return moved, left, ~(moved | left) & (occupied > _MIXED * seen_through)
+    return moved, left, ~(moved | left) & (occupied > seen_through)
 
 
 def _clusters(

@@ -45,7 +45,7 @@ _MAX_JUMP_M_S = 4.0  # greatest median deviation of the observations' steps from
 _PARTS_M = 1.0  # parts of one vehicle are closer to each other
 _BESIDE_RAD = 0.012  # and no wider gap is between their directions
 # So high things that are not longer are a rider or a person, and no part of something else.
-_WHOLE_M = (1.1, 2.2, 2.4)
+_WHOLE_M = (1.4, 2.2, 2.4)
 _PERSON_M = (1.5, 2.3)  # actors that are narrower and lower change their shape as they move
 _SHIFT_M = (
     0.5  # observations are shifted along their path by so much, to test whether they still align
@@ -97,6 +97,7 @@ class ActorFollower:
         own: (6,) lower and upper corners of the parts of the recording vehicle, metres, sensor
             frame; known after `finish`.
         riders: the numbers of the actors that are such parts; known after `finish`.
+        seen: number of points of all scans so far.
     """
 
     def __init__(
@@ -118,6 +119,7 @@ class ActorFollower:
         self.moved: dict[int, IntArray] = {}
         self.own: list[FloatArray] = []
         self.riders: set[int] = set()
+        self.seen = 0
         # in how many scans each cell has points, and in how many clusters
         self._near, self._freed = np.zeros((2, OWN_CELLS**3), np.int64)
         self._cells: dict[int, list[IntArray]] = {}
@@ -132,6 +134,7 @@ class ActorFollower:
         before it.
         """
         self.moved[scan.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
+        self.seen += scan.count
         self._poses.append(scan.world_T_sensor)
         if np.isfinite(scan.ground_m):
             self._grounds.append(scan.ground_m)

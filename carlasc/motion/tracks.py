@@ -355,6 +355,7 @@ class MovingActors:
             with the sensor: the recording vehicle.
         numbers: number of each actor over the whole sequence, by the number of its track; empty if
             not needed.
+        seen: number of points of all scans in which free space was looked for.
     """
 
     tracks: Mapping[int, Track] = field(default_factory=dict)
@@ -362,6 +363,7 @@ class MovingActors:
     summary: tuple[Mapping[str, Any], ...] = ()
     own: tuple[FloatArray, ...] = ()
     numbers: Mapping[int, int] = field(default_factory=dict)
+    seen: int = 0
 
     @classmethod
     def of(
@@ -369,6 +371,7 @@ class MovingActors:
         tracks: list[Track],
         moving: Mapping[int, AnyIntArray] | None = None,
         own: Sequence[FloatArray] = (),
+        seen: int = 0,
     ) -> Self:
         """Return the actors of tracks: moving ones with their tracks, static ones in the summary
         only.
@@ -378,6 +381,7 @@ class MovingActors:
             moving or {},
             tuple(_summarize(track) for track in tracks),
             tuple(own),
+            seen=seen,
         )
 
     def between(self, first: int, last: int) -> MovingActors:
@@ -438,7 +442,8 @@ class MovingActors:
                 frames.append((number, frame, len(own)))
         # Tables of numbers, one row per track or per scan of a track, and the values of all tracks
         # one after the other: a file of ten arrays is read at once, whatever the number of tracks.
-        about = json.dumps({"key": key, "summary": self.summary}).encode()
+        facts = {"key": key, "summary": self.summary, "seen": self.seen}
+        about = json.dumps(facts).encode()
         arrays = {
             "about": np.frombuffer(about, np.uint8),
             "table": np.array(table, np.int64).reshape(-1, 8),
@@ -479,9 +484,8 @@ class MovingActors:
                 int(frame): own
                 for (frame, _), own in zip(arrays["moving_frames"], parts, strict=False)
             }
-            return cls(tracks, moving, tuple(about["summary"]), tuple(arrays["own"])), str(
-                about["key"]
-            )
+            summary, own, seen = tuple(about["summary"]), tuple(arrays["own"]), int(about["seen"])
+            return cls(tracks, moving, summary, own, seen=seen), str(about["key"])
 
 
 def is_possible(size: Sequence[float] | FloatArray) -> bool:

@@ -320,6 +320,26 @@ class TestBadInput:
         assert "no labels" in result.notes[0]
         assert set(np.unique(grid_of(street, "x", 1).labels)) == {0, 3}
 
+    @pytest.mark.parametrize(
+        ("times", "cause"), [(None, "rain, snow or dust"), (np.r_[0:10, 40:50] / 10, "the clock")]
+    )
+    def test_many_points_that_move_without_an_actor_are_a_warning_with_its_cause(
+        self, tmp_path, times, cause
+    ):
+        street, rng = passing_car.write_sequence(tmp_path, (), frames=20), np.random.default_rng(5)
+        for file in sorted((street / "cartesian/velodyne").glob("*.bin")):  # drops of rain
+            points = np.fromfile(file, np.float32).reshape(-1, 4)
+            wet = rng.random(len(points)) < 0.2
+            points[wet, :3] *= rng.uniform(0.2, 0.8, (wet.sum(), 1)).astype(np.float32)
+            points.tofile(file)
+        if times is not None:
+            (street / "cartesian" / layout.TIMES).write_bytes(layout.encode_times(times))
+        options = {"poses": PoseOptions(refine="never")}
+        notes = make(street, "x", frames=(10, 11), settings=options).notes
+        (warning,) = (note for note in notes if "warning" in note)
+        assert "% of all points seem to move and belong to no actor" in warning
+        assert cause in warning
+
     def test_what_is_found_without_a_field_that_shows_motion_is_said(self, tmp_path):
         street = passing_car.write_sequence(tmp_path, ("labels",), frames=20)
         (note,) = make(street, "x", frames=(10, 11)).notes

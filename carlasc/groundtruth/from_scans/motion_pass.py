@@ -59,7 +59,7 @@ _NOTED_M = 0.04  # if scans disagree by more and poses do not change, there is a
 _BATCH = 200  # number of frames between estimates of finished tracks
 _ACTORS = 32  # number of actors whose tracks are estimated together
 _SHAPE_POINTS = 128  # number of points of a boxed object in a scan, for its shape and its motion
-_BLOCK = 100, 400  # least and greatest number of frames whose evidence is found in one piece
+_BLOCK = 50, 200  # least and greatest number of frames whose evidence is found in one piece
 
 _Observed = tuple[Chain, bool | None, float]
 """The segments of an actor, whether it is rigid (None: its class decides), and its confidence."""
@@ -67,10 +67,10 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def _find_evidence(
+def _evidence_of(
     block: tuple[int, ...], feed: ScanFeed, boxes: tuple[Track, ...]
-) -> list[FreeSpaceEvidence]:
-    """Find evidence of motion in the scans of a block, in a worker.
+) -> Iterator[FreeSpaceEvidence]:
+    """Find evidence of motion in the scans of a block.
 
     It also reads the scans of some seconds before and after.
     """
@@ -81,7 +81,12 @@ def _find_evidence(
     # labels that are often wrong must not split actors
     movable = feed.classes.movable if feed.trusts_ground_labels else ()
     found = find_evidence(scans, movable=movable, frames=frozenset(block))
-    return list(map(FreeSpaceEvidence.thinned, found))
+    return map(FreeSpaceEvidence.thinned, found)
+
+
+def _find_evidence(*args: Any, **options: Any) -> list[FreeSpaceEvidence]:
+    """As `_evidence_of`, in a worker."""
+    return list(_evidence_of(*args, **options))
 
 
 def _make_track(actor: _Observed, times: dict[int, float], deformable: frozenset[int]) -> Track:
@@ -140,7 +145,10 @@ def find_actors(
         default_label=0 if feed.has_labels else classes.geometry_id,
     )
     found, waiting = list[Track](), list[_Observed]()
-    with _each(partial(_find_evidence, feed=feed, boxes=moving_boxes), blocks, run) as results:
+    # This process gives each scan as soon as it can, so that progress moves.
+    is_here = run.executor is None and (run.processes == 1 or len(blocks) == 1)
+    find, blocks = (_evidence_of, [tuple(frames)]) if is_here else (_find_evidence, blocks)
+    with _each(partial(find, feed=feed, boxes=moving_boxes), blocks, run) as results:
         for evidence in chain.from_iterable(results):
             waiting += map(_observed, follower.add(evidence))
             steps(1)
@@ -152,7 +160,8 @@ def find_actors(
     tracks += found
     # points of what is too large for one actor moved, but not together
     moving = _untracked(follower.moved, [track for track in found if track.is_possible])
-    return MovingActors.of(tracks if boxes else complete_bodies(tracks), moving, follower.own)
+    tracks = tracks if boxes else complete_bodies(tracks)
+    return MovingActors.of(tracks, moving, follower.own, follower.seen)
 
 
 def _linked(feed: ScanFeed, run: Run, steps: Callable[[int], None]) -> list[Track]:

@@ -61,6 +61,10 @@ _BELOW = (
     0.2  # with a greater share of ground points below the grid, there is a note: on hills, some are
 )
 
+# fact: unexplained
+_UNEXPLAINED = 0.03  # with a greater share of points that move without an actor, there is a warning
+_UNEVEN, _APART_M = 3.0, 0.05  # its causes: steps of time over their median, and scans apart
+
 
 @dataclass(frozen=True)
 class ScanWindow:
@@ -363,6 +367,12 @@ class ScanSequence(StoredSequence):
                 f"{where}: free space shows {' and '.join(shown)}, although no field of the data "
                 f"shows it{out}"
             )
+        share = left_out / max(self.actors.seen, 1)
+        if share > _UNEXPLAINED:
+            notes.append(
+                f"{where}: warning: {share:.0%} of all points seem to move and belong to no actor, "
+                f"more than in any street: {self._cause()}"
+            )
         if self.actors.own:
             notes.append(
                 f"{where}: points near the sensor move with it: they are on the recording vehicle, "
@@ -375,6 +385,25 @@ class ScanSequence(StoredSequence):
                 f"are wrong: their points were treated as static"
             )
         return notes
+
+    def _cause(self) -> str:
+        """Return why points that stand seem to move, and what to do."""
+        steps = np.diff([self.feed.times[frame] for frame in self.feed.frames.tolist()])
+        apart = None if self.refined is None else self.refined.disagreements_m[1]
+        if len(steps) and (steps.min() <= 0 or steps.max() > _UNEVEN * np.median(steps)):
+            return (
+                f"the clock is wrong or scans are missing, as scans are {steps.min():.3f} to "
+                f"{steps.max():.3f} s apart: check times.txt"
+            )
+        if apart is not None and apart > _APART_M:
+            return (
+                f"the poses are wrong, as neighbouring scans disagree by {100 * apart:.1f} cm: try "
+                "`--poses kiss-icp` or `--refine always`, and check the calibration"
+            )
+        return (
+            "neighbouring scans agree, so it is rain, snow or dust, or poses drift over seconds: "
+            "look at these points, and compare with `--poses kiss-icp`"
+        )
 
     def _share_below(self) -> float:
         """Return the share of the ground points of some scans that are below the grid.
