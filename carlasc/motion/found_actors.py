@@ -532,10 +532,13 @@ def _join_parts(links: list[_Link], deformable: Collection[int]) -> list[_Link]:
 
 
 def _are_parts(one: _Link, other: _Link, deformable: Collection[int]) -> bool:
-    label, whole = one.segment.label, one.is_whole and other.is_whole
-    if label != other.segment.label or whole:
+    label = one.segment.label
+    if label != other.segment.label or label in deformable:
         return False
-    if label in deformable or (not (label and deformable) and one.is_small and other.is_small):
+    # labels tell people and riders from parts of vehicles
+    if not (label and deformable) and (
+        (one.is_small and other.is_small) or (one.is_whole and other.is_whole)
+    ):
         return False
     samples = [thin(link.segment.points, _SAMPLES) for link in (one, other)]
     # No ray passes between two parts of one side, however far apart it meets them.
@@ -563,7 +566,7 @@ def _link(
         if i not in taken
         for j in set(taken.values())
         if alive[j].last.segment.label == links[i].segment.label
-        and not links[i].is_whole
+        and not (links[i].is_whole and not (links[i].label and deformable))
         and alive[j].covers(links[i])
     }
     for i, j in extra.items():

@@ -100,10 +100,10 @@ def score(drive: Recorded, actors: MovingActors, kinds: dict[int, str]) -> Score
         near = np.hypot(points[:, 0], points[:, 1]) < NEAR_M
         tracked, moved = np.zeros((2, len(points)), np.bool_)
         moved[actors.moving.get(frame, [])] = True
-        for name, track in actors.tracks.items():
+        for actor, track in actors.tracks.items():
             own = track.members.get(frame, np.empty(0, np.int64))
             tracked[own] = True
-            found.owners.setdefault(name, Counter()).update(number[own].tolist())
+            found.owners.setdefault(actor, Counter()).update(number[own].tolist())
         kind = np.where(number > 0, names[number], "static")
         kind[kind == "starts"] = "rider"
         kind[(kind != "parked") & ~fast] = "static"
@@ -194,8 +194,8 @@ def main() -> None:
     parser.add_argument("--turning", action="store_true")
     parser.add_argument("--noisy", action="store_true")
     with study.begin(parser) as given:
-        heads = ("drive", *KINDS, "parked", "static", "trail", "actors / truth", "found", "merged")
-        heads = (*heads, "false", "height, width", "CPU s", "points")
+        heads = ["drive", *KINDS, "parked", "static", "trail", "actors / truth", "found", "merged"]
+        heads += ["false", "height, width", "CPU s", "points"]
         print(f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}")
         for seed in study.few(given.crowded):
             channels = 32 if study.is_tiny() else given.channels

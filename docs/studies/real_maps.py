@@ -68,8 +68,8 @@ def rows(scans: Mapping[int, NDArray[np.float32]], judge: Judge, work: Path) -> 
     }
     stays = places_that_stay(world)
     named = (NAMES.get(name, name) for name in bodies)
-    yield f"| recording | scans | {' | '.join(named)} | structure |"
-    yield "|---|" + "---:|" * (len(bodies) + 2)
+    yield f"| recording | {' | '.join(named)} | structure |"
+    yield "|---|" + "---:|" * (len(bodies) + 1)
     frames = list(scans)
     middle = frames[(len(frames) - FILES) // 2 :][:FILES]
     recordings = (("bag", bag, frames), ("bare files", files, middle))
