@@ -157,10 +157,9 @@ class Crowd(Population):
                     x = float(begin) + _ROW_M * k
                     parked = User("parked", x, side * _PARKED_Y_M, yaw, 0.0, scooter_mesh(False))
                     if k == leaves:
-                        starts = {"kind": "starts", "speed": float(rng.uniform(1.2, 2.0))}
-                        when = float(rng.uniform(1.0, 2.5))
-                        rides = scooter_mesh(True)
-                        parked = replace(parked, **starts, shape=rides, starts_s=when)
+                        pace, when = float(rng.uniform(1.2, 2.0)), float(rng.uniform(1.0, 2.5))
+                        ridden = replace(parked, kind="starts", speed=pace, starts_s=when)
+                        parked = replace(ridden, shape=scooter_mesh(True))
                     self._add(parked, gap_m=-1.0)
 
     def _riders(self, rng: np.random.Generator, speed: float) -> None:
@@ -194,9 +193,11 @@ class Crowd(Population):
             y = float(rng.choice((-1.0, 1.0))) * (HALF_ROAD_M + float(rng.uniform(2.3, 3.6)))
             self._person(rng, float(rng.uniform(-20, 40)), y, float(rng.uniform(0, 6)), 0.0)
 
-    def _person(self, rng: np.random.Generator, *place: float) -> bool:
-        """Add a person: x, y, direction and speed."""
-        return self._add(User("person", *place, float(rng.uniform(1.5, 1.9))))
+    def _person(
+        self, rng: np.random.Generator, x: float, y: float, yaw: float, speed: float
+    ) -> bool:
+        """Add a person."""
+        return self._add(User("person", x, y, yaw, speed, float(rng.uniform(1.5, 1.9))))
 
     def _add(self, user: User, gap_m: float = _GAP_M) -> bool:
         """Add a road user unless it comes too near to another; return whether it was added. Along

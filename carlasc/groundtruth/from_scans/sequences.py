@@ -61,7 +61,6 @@ _BELOW = (
     0.2  # with a greater share of ground points below the grid, there is a note: on hills, some are
 )
 
-# fact: unexplained
 _UNEXPLAINED = 0.03  # with a greater share of points that move without an actor, there is a warning
 _UNEVEN, _APART_M = 3.0, 0.05  # its causes: steps of time over their median, and scans apart
 
