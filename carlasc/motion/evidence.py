@@ -269,7 +269,9 @@ def cells_around(points: AnyFloatArray) -> IntArray:
     if not len(near):
         return np.empty(0, np.int64)
     cells = np.floor(near / OWN_CELL_M).astype(np.int64) + OWN_CELLS // 2
-    return np.unique(np.ravel_multi_index(tuple(cells.T), (OWN_CELLS,) * 3, mode="clip"))
+    flags = np.zeros(OWN_CELLS**3, np.bool_)  # faster than `np.unique`
+    flags[np.ravel_multi_index(tuple(cells.T), (OWN_CELLS,) * 3, mode="clip")] = True
+    return np.flatnonzero(flags)
 
 
 def _sensors(origins: Float32Array) -> list[IntArray]:
@@ -386,16 +388,14 @@ def _clusters(
     order = kept[np.argsort(component[kept], kind="stable")]
     for group in np.split(order, np.flatnonzero(np.diff(component[order])) + 1):
         members = inside[group]
-        core = members[seeds[flat[group]]]
+        core = seeds[flat[group]]
         count = int(either[members].sum())
         if count < _MIN_POINTS:
             continue
         # Of an object that moved as a whole, static points belong to it too: its sides often pass
         # the places of its own earlier surface. Otherwise static points are of something behind it.
-        if count < _FLAGGED_SHARE * len(core):
-            members = members[~static[members]]
-        else:
-            members = np.union1d(core, members[~static[members]])
+        whole = count >= _FLAGGED_SHARE * np.count_nonzero(core)
+        members = members[~static[members] | (core & whole)]
         groups.append(np.sort(members))
     return groups
 

@@ -5,7 +5,7 @@ They are followed from scan to scan.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -133,7 +133,7 @@ class ActorFollower:
         """Add the evidence of the next scan, and return the actors with enough evidence that ended
         before it.
         """
-        self.moved[scan.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
+        self.moved[scan.frame] = np.sort(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
         self.seen += scan.count
         self._poses.append(scan.world_T_sensor)
         if np.isfinite(scan.ground_m):
@@ -332,17 +332,10 @@ class _ActorChain:
         least = np.take_along_axis(slopes, np.abs(slopes).argmin(axis=0)[None], axis=0)[0]
         return np.where(np.abs(slopes).max(axis=0) > 0, (least + slopes[1]) / 2, 0.0)
 
-    def expected(self, link: _Link) -> FloatArray | None:
-        """Return (M, 3) points of the actor, metres, world, where they are expected in the scan of
-        an observation; None unless they are expected in its place, or nothing is known yet.
-        """
-        velocity = self.velocity
-        if velocity is None or len(self.links) < _KNOWN or self.last.segment.label != link.label:
-            return None
-        shift = velocity * (link.seconds - self.last.seconds)
-        middle = self.last.middle + shift
-        inside = (middle > link.lower - _NEAR_M) & (middle < link.upper + _NEAR_M)
-        return thin(self.last.segment.points, _MODEL) + shift if inside[:2].all() else None
+    def shift(self, seconds: float) -> FloatArray:
+        """Return (3,) how far the actor has come at a time since its last observation, metres."""
+        moved = np.zeros(3) if self.velocity is None else self.velocity
+        return moved * (seconds - self.last.seconds)
 
     def is_apart(self, other: _ActorChain) -> bool:
         """Whether it cannot be a part of the same actor."""
@@ -353,8 +346,7 @@ class _ActorChain:
 
     def covers(self, link: _Link) -> bool:
         """Return whether an observation is inside the place that is expected of the next one."""
-        velocity = self.velocity
-        shift = np.zeros(3) if velocity is None else velocity * (link.seconds - self.last.seconds)
+        shift = self.shift(link.seconds)
         lower, upper = self.last.lower + shift - 0.3, self.last.upper + shift + 0.3
         return bool(((link.middle > lower) & (link.middle < upper))[:2].all())
 
@@ -491,21 +483,31 @@ def _is_small(size: FloatArray) -> bool:
     return float(np.hypot(size[0], size[1])) < _PERSON_M[0] and float(size[2]) < _PERSON_M[1]
 
 
-def _split(link: _Link, alive: list[_ActorChain]) -> list[_Link]:
-    """Split a cluster in which several actors are expected that move differently, or that are
+def _split(links: list[_Link], alive: list[_ActorChain]) -> Iterator[_Link]:
+    """Split each cluster in which several actors are expected that move differently, or that are
     riders or people: each point belongs to the nearest of the points that are expected.
     """
-    inside, models = list[_ActorChain](), list[FloatArray]()
-    for chain in sorted(alive, key=lambda chain: -len(chain.links)):
-        model = chain.expected(link)
-        if model is not None and all(chain.is_apart(other) for other in inside):
-            inside.append(chain)
-            models.append(model)
-    if len(inside) < 2:
-        return [link]
-    of_chain = np.repeat(np.arange(len(models)), [len(model) for model in models])
-    nearest = of_chain[nearest_points(link.segment.points, np.concatenate(models))[0]]
-    return [link.part(nearest == k) for k in np.unique(nearest)]
+    known = [chain for chain in alive if len(chain.links) >= _KNOWN]
+    if not known:
+        yield from links
+        return
+    known.sort(key=lambda chain: -len(chain.links))
+    moves = [chain.shift(links[0].seconds) for chain in known] if links else []
+    middles = np.array([one.last.middle + move for one, move in zip(known, moves, strict=True)])
+    labels = np.array([chain.last.label for chain in known])
+    for link in links:
+        near = (middles > link.lower - _NEAR_M) & (middles < link.upper + _NEAR_M)
+        inside = list[int]()
+        for k in np.flatnonzero(near[:, :2].all(axis=1) & (labels == link.label)):
+            if all(known[k].is_apart(known[other]) for other in inside):
+                inside.append(int(k))
+        if len(inside) < 2:
+            yield link
+            continue
+        models = [thin(known[k].last.segment.points, _MODEL) + moves[k] for k in inside]
+        of_chain = np.repeat(np.arange(len(models)), [len(model) for model in models])
+        nearest = of_chain[nearest_points(link.segment.points, np.concatenate(models))[0]]
+        yield from (link.part(nearest == k) for k in np.unique(nearest))
 
 
 def _join_parts(links: list[_Link], deformable: Collection[int]) -> list[_Link]:
@@ -557,7 +559,7 @@ def _link(
     start new chains with the rest.
     """
     clusters = [_Link.of(evidence, index) for index in range(len(evidence.clusters))]
-    apart = [part.thinned(_KEPT) for link in clusters for part in _split(link, alive)]
+    apart = [part.thinned(_KEPT) for part in _split(clusters, alive)]
     links = _join_parts(apart, deformable)
     taken = best_pairs(_costs(links, alive) if alive else [])
     extra = {

@@ -40,8 +40,8 @@ from carlasc.storage.files import parse_json
 
 _EXTRAPOLATE_S = 0.5  # a track extends beyond its first and its last segment by this time
 _STATIC_M = 0.5  # the visible part of a static actor may seem to move this far
-# No actor is longer, wider or higher: a larger one has points of other things.
-LONGEST_M, _WIDEST_M, _HIGHEST_M = 30.0, 4.0, 5.0
+# No actor, with its margins, is longer, wider or higher: a larger one has points of other things.
+LONGEST_M, _WIDEST_M, _HIGHEST_M = 30.0, 4.2, 5.0
 _SURE = 0.8  # actors with less confidence are doubtful
 _END = 0.02  # share of the points of a scan beyond each end of what it shows
 _ASIDE = 0.1  # weight of an end that is not turned to the sensor

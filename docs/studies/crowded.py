@@ -158,13 +158,8 @@ class Crowd(Population):
                     parked = User("parked", x, side * _PARKED_Y_M, yaw, 0.0, scooter_mesh(False))
                     if k == leaves:
                         pace, when = float(rng.uniform(1.2, 2.0)), float(rng.uniform(1.0, 2.5))
-                        parked = replace(
-                            parked,
-                            kind="starts",
-                            speed=pace,
-                            shape=scooter_mesh(True),
-                            starts_s=when,
-                        )
+                        ridden = replace(parked, kind="starts", speed=pace, starts_s=when)
+                        parked = replace(ridden, shape=scooter_mesh(True))
                     self._add(parked, gap_m=-1.0)
 
     def _riders(self, rng: np.random.Generator, speed: float) -> None:

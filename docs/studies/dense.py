@@ -38,6 +38,10 @@ SEEDS = {"crowded": range(361, 366)}
 NEAR_M = 25.0
 MOVES_M_S = 0.4  # faster actors move
 KINDS = ("car", "truck", "rider", "person")
+HEADS = (
+    "parked | static | trail | actors / truth | found | merged | false | height, width | CPU s | "
+    "points"
+)
 _ABOVE_M = 0.3  # wheels and feet below are beside ground, which is occupied
 _SEEN = 5, 20  # an actor counts with so many points in so many scans
 
@@ -100,10 +104,10 @@ def score(drive: Recorded, actors: MovingActors, kinds: dict[int, str]) -> Score
         near = np.hypot(points[:, 0], points[:, 1]) < NEAR_M
         tracked, moved = np.zeros((2, len(points)), np.bool_)
         moved[actors.moving.get(frame, [])] = True
-        for actor, track in actors.tracks.items():
+        for found_number, track in actors.tracks.items():
             own = track.members.get(frame, np.empty(0, np.int64))
             tracked[own] = True
-            found.owners.setdefault(actor, Counter()).update(number[own].tolist())
+            found.owners.setdefault(found_number, Counter()).update(number[own].tolist())
         kind = np.where(number > 0, names[number], "static")
         kind[kind == "starts"] = "rider"
         kind[(kind != "parked") & ~fast] = "static"
@@ -194,9 +198,8 @@ def main() -> None:
     parser.add_argument("--turning", action="store_true")
     parser.add_argument("--noisy", action="store_true")
     with study.begin(parser) as given:
-        heads = ["drive", *KINDS, "parked", "static", "trail", "actors / truth", "found", "merged"]
-        heads += ["false", "height, width", "CPU s", "points"]
-        print(f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}")
+        kinds = " | ".join(KINDS)
+        print(f"| drive | {kinds} | {HEADS} |\n|{'---|' * (2 + len(KINDS) + HEADS.count('|'))}")
         for seed in study.few(given.crowded):
             channels = 32 if study.is_tiny() else given.channels
             setting = Setting("crowded", seed, channels, int(given.turning))

@@ -329,7 +329,7 @@ class TestBadInput:
         street, rng = passing_car.write_sequence(tmp_path, (), frames=20), np.random.default_rng(5)
         for file in sorted((street / "cartesian/velodyne").glob("*.bin")):  # drops of rain
             points = np.fromfile(file, np.float32).reshape(-1, 4)
-            wet = rng.random(len(points)) < 0.2
+            wet = rng.random(len(points)) < 0.05
             points[wet, :3] *= rng.uniform(0.2, 0.8, (wet.sum(), 1)).astype(np.float32)
             points.tofile(file)
         if times is not None:

@@ -7,6 +7,7 @@ import pytest
 from helpers.references.whole_drives import link_segments
 
 from carlasc.motion import Segment, StaticPoints
+from carlasc.motion.tracks import is_possible
 
 CAR, PERSON = 10, 4
 TIMES = {frame: 0.1 * frame for frame in range(100)}
@@ -166,3 +167,17 @@ def test_people_are_as_large_as_their_points():
 def test_what_is_longer_than_any_vehicle_is_several_things_and_does_not_move(length, moves):
     (track,) = link_segments(drive(range(20), size=(length, 2.5, 3.0)), TIMES)
     assert track.moves == moves
+
+
+@pytest.mark.parametrize(
+    ("size", "possible"),
+    [
+        ((11.2, 2.5, 3.1), True),
+        ((2.5, 11.2, 3.1), True),  # its heading is wrong
+        ((31.0, 2.5, 3.0), False),
+        ((8.0, 6.0, 2.0), False),
+        ((4.0, 2.0, 19.0), False),
+    ],
+)
+def test_one_actor_is_not_larger_than_a_vehicle_in_any_direction(size, possible):
+    assert is_possible(size) == possible

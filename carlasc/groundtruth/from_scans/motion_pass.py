@@ -220,10 +220,9 @@ def _untracked(moved: dict[int, IntArray], tracks: list[Track]) -> dict[int, Any
         for frame, members in track.members.items():
             tracked.setdefault(frame, []).append(members)
     nothing = np.empty(0, np.int64)
+    own = {frame: np.concatenate([nothing, *tracked.get(frame, [])]) for frame in moved}
     return {
-        frame: np.setdiff1d(points, np.concatenate([nothing, *tracked.get(frame, [])])).astype(
-            np.int32
-        )
+        frame: points[~np.isin(points, own[frame], kind="table")].astype(np.int32)
         for frame, points in moved.items()
     }
 
