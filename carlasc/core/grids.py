@@ -361,6 +361,12 @@ class GridSpec:
         ]
         return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
 
+    def centers_of(self, voxels: AnyIntArray) -> FloatArray:
+        """Return the (N, 3) centres of voxels, metres, from their (N,) flat indices."""
+        index = np.stack(np.unravel_index(voxels, self.size), axis=-1)
+        axes = np.asarray(self.lower) + (index + 0.5) * self.voxel_size
+        return self.from_axes(axes).astype(np.float64)
+
     def __str__(self) -> str:
         return f"{self.coordinates} {' x '.join(map(str, self.size))}"
 

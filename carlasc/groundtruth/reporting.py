@@ -154,12 +154,13 @@ def _distances(one: AnyFloatArray, other: AnyFloatArray) -> AnyFloatArray:
     """Return the distances from some points of each observation to the nearest point of the other,
     metres.
     """
-    from carlasc.motion.planes import nearest_points  # loads Numba
-
-    one, other = (np.ascontiguousarray(points, np.float64) for points in (one, other))
-    pairs = (one, other), (other, one)
-    squared = [nearest_points(thin(a, _MOST_ASKED).copy(), b)[1] for a, b in pairs]
-    return np.sqrt(np.concatenate(squared))
+    nearest_m = []
+    for asked, others in ((one, other), (other, one)):
+        axes = zip(thin(asked, _MOST_ASKED).T, others.T, strict=True)
+        # several times faster axis by axis than point by point
+        squares = sum(np.square(a[:, None] - b) for a, b in axes)
+        nearest_m.append(np.sqrt(np.min(squares, axis=1)))
+    return np.concatenate(nearest_m)
 
 
 POWERS = 24

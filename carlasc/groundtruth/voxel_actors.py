@@ -14,7 +14,6 @@ import numpy as np
 from carlasc.captures.raw import SensorRecording
 from carlasc.core.arrays import (
     AnyFloatArray,
-    AnyIntArray,
     BoolArray,
     FloatArray,
     IntArray,
@@ -148,16 +147,8 @@ class ActorPoints:
             own = np.flatnonzero(
                 (rows["actor"] == actor) & ~np.isin(rows["label"], list(self.deformable))
             )
-            arm = centers_of(self.spec, rows["voxel"][own])[:, :2] - (lower + upper) / 2
+            arm = self.spec.centers_of(rows["voxel"][own])[:, :2] - (lower + upper) / 2
             velocity[own, :2] += self.turns[actor] * np.column_stack([-arm[:, 1], arm[:, 0]])
-
-
-def centers_of(spec: GridSpec, voxels: AnyIntArray) -> FloatArray:
-    """Return the (N, 3) centres of voxels, metres, grid frame, from their (N,) flat indices."""
-    index = np.stack(np.unravel_index(voxels, spec.size), axis=-1)
-    return spec.from_axes(
-        np.asarray(spec.lower) + (index + 0.5) * np.asarray(spec.voxel_size)
-    ).astype(np.float64)
 
 
 def _sum(rows: RecordArray) -> RecordArray:

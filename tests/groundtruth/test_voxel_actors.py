@@ -23,7 +23,7 @@ from carlasc.groundtruth.from_scans.actor_voxels import velocity_at
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.sequences import ScanFrame, ScanSequence
 from carlasc.groundtruth.inputs import GridPlan
-from carlasc.groundtruth.voxel_actors import ActorPoints, centers_of, number_actors
+from carlasc.groundtruth.voxel_actors import ActorPoints, number_actors
 from carlasc.motion import Extent, MotionOptions, Track
 from carlasc.motion.tracks import FIRST_FOUND, MovingActors
 from carlasc.storage import FolderSink, FolderSource, field_files
@@ -263,7 +263,7 @@ def test_the_voxels_of_a_turning_actor_of_a_capture_differ(tmp_path):
         sequence.read("evaluation/instance", 0).reshape(-1),
     )
     own = rotate_vectors(invert(pose), 6 * np.array([[np.cos(0.2), np.sin(0.2), 0]]))
-    arm = centers_of(COARSE, found["voxel"]) - [5.0, 0, 0]
+    arm = COARSE.centers_of(found["voxel"]) - [5.0, 0, 0]
     turning = own + rate * np.column_stack([-arm[:, 1], arm[:, 0], np.zeros(len(arm))])
     expected = np.where(instance[found["voxel"], None] == 7, turning, own)
     assert set(instance[found["voxel"]].tolist()) == {7, 8} and np.ptp(turning, axis=0).max() > 3

@@ -23,7 +23,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.core.scans import finite
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import STATIC, BodyRegions, Instant
-from carlasc.groundtruth.voxel_actors import VoxelActors, centers_of, number_actors
+from carlasc.groundtruth.voxel_actors import VoxelActors, number_actors
 from carlasc.motion.tracks import FIRST_FOUND, MovingActors, Track
 
 _CLASS_PARTS = 1 << 10  # in the upper 16 bits, smaller values may be a class
@@ -78,7 +78,7 @@ def find_voxels(
     movable = solid & classes.have_role(labels, "movable") if feed.has_labels else solid
     voxels, velocities = [np.empty(0, np.int64)], [np.empty((0, 3))]
     bodies = np.flatnonzero((regions.of_voxel != STATIC) & solid)
-    centers = transform_points(now.world_T_grid, centers_of(spec, bodies))
+    centers = transform_points(now.world_T_grid, spec.centers_of(bodies))
     for region, number in regions.actors.items():
         track = actors.tracks[number]
         own = (regions.of_voxel[bodies] == region) & (
@@ -177,7 +177,7 @@ def _number_boxes(
     moving = {track.instance for track in actors.tracks.values()}
     voxels = np.flatnonzero(free)
     centers, half = (
-        centers_of(spec, voxels),
+        spec.centers_of(voxels),
         np.asarray(spec.voxel_size if spec.coordinates == "cartesian" else (0, 0, 0)) / 2,
     )
     # The largest box first: a smaller box inside of it overwrites its voxels.

@@ -47,7 +47,7 @@ from carlasc.groundtruth.voting.certainty import (
     matter_of,
     probability,
 )
-from carlasc.groundtruth.voxel_actors import VoxelActors, centers_of
+from carlasc.groundtruth.voxel_actors import VoxelActors
 from carlasc.motion.tracks import MovingActors
 
 # The volume that is inside of any recording vehicle: metres around the sensor.
@@ -392,7 +392,7 @@ class _FrameSteps:
         frame or of its neighbours passed.
         """
         passed = np.zeros(len(voxels), np.bool_)
-        world = transform_points(self.now.world_T_grid, centers_of(self.plan.spec, voxels))
+        world = transform_points(self.now.world_T_grid, self.plan.spec.centers_of(voxels))
         size_m = float(self.plan.spec.voxel_size[[0, 2]].min())
         recent = set(self.merger.recent(self.now, self.window))
         for body in bodies:
