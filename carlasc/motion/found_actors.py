@@ -488,11 +488,11 @@ def _split(links: list[_Link], alive: list[_ActorChain]) -> Iterator[_Link]:
     riders or people: each point belongs to the nearest of the points that are expected.
     """
     known = [chain for chain in alive if len(chain.links) >= _KNOWN]
-    if not known:
+    if not (known and links):
         yield from links
         return
     known.sort(key=lambda chain: -len(chain.links))
-    moves = [chain.shift(links[0].seconds) for chain in known] if links else []
+    moves = [chain.shift(links[0].seconds) for chain in known]
     middles = np.array([one.last.middle + move for one, move in zip(known, moves, strict=True)])
     labels = np.array([chain.last.label for chain in known])
     for link in links:
