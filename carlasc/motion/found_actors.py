@@ -533,14 +533,20 @@ def _join_parts(links: list[_Link], deformable: Collection[int]) -> list[_Link]:
     return joined
 
 
+def _is_rider(link: _Link, deformable: Collection[int]) -> bool:
+    """Return whether an observation is a rider or a person by its size, which counts where no label
+    tells them from parts of vehicles.
+    """
+    return link.is_whole and not (link.label and deformable)
+
+
 def _are_parts(one: _Link, other: _Link, deformable: Collection[int]) -> bool:
-    label = one.segment.label
-    if label != other.segment.label or label in deformable:
+    label = one.label
+    if label != other.label or label in deformable:
         return False
-    # labels tell people and riders from parts of vehicles
-    if not (label and deformable) and (
-        (one.is_small and other.is_small) or (one.is_whole and other.is_whole)
-    ):
+    if _is_rider(one, deformable) and _is_rider(other, deformable):
+        return False
+    if not (label and deformable) and one.is_small and other.is_small:
         return False
     samples = [thin(link.segment.points, _SAMPLES) for link in (one, other)]
     # No ray passes between two parts of one side, however far apart it meets them.
@@ -567,8 +573,8 @@ def _link(
         for i in range(len(links))
         if i not in taken
         for j in set(taken.values())
-        if alive[j].last.segment.label == links[i].segment.label
-        and not (links[i].is_whole and not (links[i].label and deformable))
+        if alive[j].last.label == links[i].label
+        and not _is_rider(links[i], deformable)
         and alive[j].covers(links[i])
     }
     for i, j in extra.items():
@@ -585,7 +591,7 @@ def _costs(links: list[_Link], alive: list[_ActorChain]) -> list[tuple[float, in
     of both.
     """
     ends = [chain.last for chain in alive]
-    label = np.array([end.segment.label for end in ends])
+    label = np.array([end.label for end in ends])
     seconds = np.array([end.seconds for end in ends])
     lower, upper = (np.stack([getattr(end, name) for end in ends]) for name in ("lower", "upper"))
     middle, size = (lower + upper) / 2, upper - lower

@@ -12,7 +12,7 @@ from functools import cache
 
 import numpy as np
 from carlasc_recorders import TownActor
-from carlasc_recorders.town.actors import EGO_ID, STRIDE_M, Population
+from carlasc_recorders.town.actors import STRIDE_M
 from carlasc_recorders.town.meshes import Mesh, MeshBuilder
 from carlasc_recorders.town.plan import KERB_M
 from carlasc_recorders.town.shapes import (
@@ -34,11 +34,12 @@ from street import (
     TOWARDS_Y_M,
     WALK_M,
     StreetDrive,
+    StreetPopulation,
     build_street,
 )
 
 from carlasc.captures import Lidar
-from carlasc.core.geometry import Transform, rotation_z, translation
+from carlasc.core.geometry import rotation_z, translation
 from carlasc.core.tables import CARLA
 from carlasc.storage.layout import FRAME_PERIOD_S
 
@@ -108,15 +109,15 @@ class User:
         return place[:, None] + np.stack([around.min(axis=0), around.max(axis=0)])
 
 
-class Crowd(Population):
+class Crowd(StreetPopulation):
     """Everything that moves or is parked on a crowded street: the vehicle that records first.
 
     Attributes:
-        users: all of them, by number from `EGO_ID` on.
+        movers: all of it, by number from `EGO_ID` on: the vehicle that records first.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
-        self.users: list[User] = []
+        self.movers: list[User] = []
         self._bounds: list[NDArray[np.float64]] = []
         speed = float(rng.uniform(2.5, 6.0))
         self._add(User("car", 0.0, EGO_Y_M, 0.0, speed, vehicle_mesh(EGO_KIND)))
@@ -142,7 +143,7 @@ class Crowd(Population):
             yaw = -side * np.pi / 2 + float(rng.normal(0.0, 0.2))
             x, pace = float(rng.uniform(-18.0, 40.0)), float(rng.uniform(1.0, 1.8))
             self._person(rng, x, side * y, yaw, pace)
-            if sum(user.kind == "person" for user in self.users) == _ACROSS:
+            if sum(user.kind == "person" for user in self.movers) == _ACROSS:
                 break
         self._riders(rng, speed)
         self._people(rng)
@@ -208,17 +209,9 @@ class Crowd(Population):
             gaps = np.maximum(bounds[:, 0] - other[:, 1], other[:, 0] - bounds[:, 1])
             if (gaps < (gap_m, _GAP_M)).all(axis=1).any():
                 return False
-        self.users.append(user)
+        self.movers.append(user)
         self._bounds.append(bounds)
         return True
-
-    def ego_pose(self, frame: int) -> Transform:
-        """Return (4, 4) world_T_ego of a frame."""
-        return self.users[0].at(EGO_ID, frame).world_T_actor
-
-    def at(self, frame: int) -> list[TownActor]:
-        """Return all actors in a frame, the vehicle that records first."""
-        return [user.at(EGO_ID + index, frame) for index, user in enumerate(self.users)]
 
 
 class CrowdedDrive(StreetDrive):

@@ -185,7 +185,7 @@ def measure(setting: Setting, work: Path, *, noisy: bool = False) -> str:
     actors = find_actors(feed)
     cpu_s = (time.process_time() - start) / len(feed.frames)
     crowd = crowded.CrowdedDrive(setting.seed).crowd
-    kinds = {EGO_ID + k: user.kind for k, user in enumerate(crowd.users)}
+    kinds = {EGO_ID + k: user.kind for k, user in enumerate(crowd.movers)}
     scores = score(drive, actors, kinds)
     scores.cpu_s, scores.trail = cpu_s, trail(drive, feed, actors, crowd)
     return row(str(setting), scores, actors)

@@ -9,8 +9,10 @@ them keep their speed. Nothing is parked.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 from carlasc_recorders import TownActor, TownDrive
@@ -86,8 +88,33 @@ class Mover:
         return TownActor(number, pose, np.array([sign * self.speed, 0.0, 0.0]), mesh)
 
 
-class Traffic(Population):
-    """Everything that moves on a street, in any frame: the vehicle that records first."""
+class Moving(Protocol):
+    """What moves by itself."""
+
+    def at(self, number: int, frame: int) -> TownActor:
+        """Return it in a frame, with a number."""
+
+
+class StreetPopulation(Population):
+    """Everything that moves on a street, in any frame.
+
+    Attributes:
+        movers: all of it, by number from `EGO_ID` on: the vehicle that records first.
+    """
+
+    movers: Sequence[Moving]
+
+    def ego_pose(self, frame: int) -> Transform:
+        """Return (4, 4) world_T_ego of a frame."""
+        return self.movers[0].at(EGO_ID, frame).world_T_actor
+
+    def at(self, frame: int) -> list[TownActor]:
+        """Return all actors in a frame, the vehicle that records first."""
+        return [mover.at(EGO_ID + index, frame) for index, mover in enumerate(self.movers)]
+
+
+class Traffic(StreetPopulation):
+    """The traffic of a street."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         speed = float(rng.uniform(6.0, 12.0))
@@ -117,14 +144,6 @@ class Traffic(Population):
             self.movers.append(
                 Mover(float(rng.uniform(-40.0, 130.0)), y, pace, height, bool(rng.random() < 0.5))
             )
-
-    def ego_pose(self, frame: int) -> Transform:
-        """Return (4, 4) world_T_ego of a frame."""
-        return self.movers[0].at(EGO_ID, frame).world_T_actor
-
-    def at(self, frame: int) -> list[TownActor]:
-        """Return all actors in a frame, the vehicle that records first."""
-        return [mover.at(EGO_ID + index, frame) for index, mover in enumerate(self.movers)]
 
 
 class StreetDrive(TownDrive):

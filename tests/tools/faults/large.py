@@ -160,7 +160,7 @@ def run(count: int, seed: int, folder: Path) -> Outcome:
     began, found, measured = time.monotonic(), list[str](), list[Measured]()
     for large in LARGE:
         size = large.full if count >= 1000 else large.quick if count else large.least
-        count_calls = size == large.least
+        count_calls = not count
         sizes = [size * part // _PARTS for part in (1, 2, 4)]
         if count_calls:  # the first run compiles
             _costs(large, sizes[0], folder / large.name, count_calls)
