@@ -224,7 +224,8 @@ def _names(line: str, path: str, case: Path) -> bool:
     store that it is in, unless a temporary folder takes its place at once.
     """
     relative = Path(path).relative_to(case).as_posix()
-    final = re.sub(r"\.([^/]+?)(?:\.[^./]+-[0-9]+\.[0-9a-f]{8})?\.part(?=/|$)", r"\1", relative)
+    part = r"(^|/)\.([^/]+?)(?:\.[^./]+-[0-9]+\.[0-9a-f]{8})?\.part(?=/|$)"
+    final = re.sub(part, r"\1\2", relative)
     if final == ".":  # all files are in it
         return True
     names = {final}
