@@ -101,7 +101,7 @@ def rows(scans: Mapping[int, NDArray[np.float32]], judge: Judge, work: Path) -> 
             f"{share.percent:.2f}% of {share.whole:,}" if share.whole else ""
             for share in left.values()
         ]
-        yield f"| {name} | {len(chosen)} | {' | '.join(cells)} | {kept.percent:.2f}% |"
+        yield f"| {name}, {len(chosen)} scans | {' | '.join(cells)} | {kept.percent:.2f}% |"
 
 
 def walkers(scans: Mapping[int, NDArray[np.float32]], judge: Judge) -> Iterator[Body]:
