@@ -5,6 +5,7 @@ from .recorders import load_recorder as load_recorder
 from .recorders import record as record
 from .recorders import recorder_names as recorder_names
 from .settings import Lidar as Lidar
+from .settings import LidarEffects as LidarEffects
 from .settings import ServerOptions as ServerOptions
 from .settings import TrafficLevel as TrafficLevel
 from .simulation import SimulationResult as SimulationResult

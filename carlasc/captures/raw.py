@@ -19,6 +19,7 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
+from carlasc.captures.settings import LidarEffects
 from carlasc.core.arrays import Float32Array, FloatArray, IntArray, Uint8Array
 from carlasc.core.cameras import CameraModel
 from carlasc.core.classes import ClassTable
@@ -141,7 +142,10 @@ class Capture:
         tree: the files of the sequence, or of raw/ itself.
         location: name of the folder raw/ in errors: a folder or a URL.
         classes: class table of the labels.
+        effects: how the scans of the ego sensor differ from recordings.
     """
+
+    effects = LidarEffects()
 
     def __init__(self, source: AnyPath | Tree, classes: ClassTable = CARLA) -> None:
         """Keep the folder of a capture. Sensors and frames are listed on first use.
@@ -212,6 +216,10 @@ class Capture:
                 self.location, expected="frames such as velodyne0/100.npy", found="none"
             )
         return np.array(sorted(numbers), np.int64)
+
+    def read_scan(self, frame: int) -> SensorRecording:
+        """Read the scan of a frame, which need not be as ideal as the recording of sensor 0."""
+        return self.read(0, frame)
 
     def read(self, sensor: int, frame: int) -> SensorRecording:
         """Read the recording of a sensor in a frame.

@@ -18,7 +18,7 @@ import numpy as np
 
 from carlasc.captures.raw import Capture, SensorRecording
 from carlasc.captures.recorders import load_recorder
-from carlasc.captures.settings import Lidar, TrafficLevel, check_at_least
+from carlasc.captures.settings import Lidar, LidarEffects, TrafficLevel, check_at_least
 from carlasc.captures.writing import CaptureWriter, TimesLog
 from carlasc.core.arrays import FloatArray, IntArray, Uint8Array
 from carlasc.core.cameras import CameraModel
@@ -51,6 +51,7 @@ class Simulator(Capture, ABC):
         seed: seed of all random choices.
         traffic: "light", "medium" or "heavy".
         lidar: model of the LiDARs.
+        effects: how the scans of the ego sensor differ from an ideal LiDAR's.
         bev: whether bird's-eye pictures are drawn.
     """
 
@@ -72,8 +73,10 @@ class Simulator(Capture, ABC):
         lidar: Lidar | None = None,
         bev: bool = True,
         cameras: Sequence[str] = (),
+        effects: LidarEffects = LidarEffects(),  # noqa: B008 (frozen)
     ) -> None:
-        """Keep the settings of a simulation. The arguments are those of `carlasc.simulate`.
+        """Keep the settings of a simulation. The arguments are those of `carlasc.simulate`, and
+        `effects`, which only scans have that come with ground truth: a capture is ideal.
 
         Raises:
             ArgumentError: an argument is out of its range.
@@ -85,6 +88,7 @@ class Simulator(Capture, ABC):
         self._frames, self._sensors = range(first_frame, first_frame + count), sensors
         self.seed, self.traffic, self.lidar, self.bev = seed, traffic, lidar or Lidar(), bev
         self.cameras = {camera.name: camera for camera in self.make_cameras(cameras)}
+        self.effects = effects
 
     @abstractmethod
     def read(self, sensor: int, frame: int) -> SensorRecording:
@@ -122,6 +126,7 @@ class Simulator(Capture, ABC):
             **{"seed": self.seed, "traffic": self.traffic, "sensors": self._sensors},
             **{"bev": self.bev, "lidar": dataclasses.asdict(self.lidar), "recipe": self.recipe},
             **({"cameras": list(self.cameras)} if self.cameras else {}),
+            **({"effects": vars(self.effects)} if self.effects != LidarEffects() else {}),
         }
 
     @cached_property

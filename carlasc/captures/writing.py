@@ -74,6 +74,7 @@ class CaptureWriter:
                 )
             return
         earlier = parse_json(bytes(self.target.tree.read(file)), where)
+        settings = parse_json(to_json(settings), where)  # tuples are lists in files
         differing = [
             key
             for key in sorted(settings.keys() | earlier.keys())

@@ -56,6 +56,7 @@ TABLE = {
     "carlasc.Voting": Shown("Votes", renamed={"rule": "--voting", "keep": "--keep-votes"}),
     "carlasc.audit": Shown(files="keep"),
     "carlasc.captures.Lidar": Shown("Traffic and sensors", renamed={"range_m": "--range"}),
+    "carlasc.captures.LidarEffects": Shown("Effects on scans that come with ground truth"),
     "carlasc.convert": Shown(hidden="sequences"),
     "carlasc.evaluate": Shown(hidden="convention name"),
     "carlasc.export": Shown(hidden="sequences"),

@@ -12,6 +12,9 @@ from carlasc.cli.capture import CamerasOption, OutArgument, SensorFlags, camera_
 from carlasc.cli.common import Json, print_frames, print_json, show
 from carlasc.cli.flags import PartFlags
 from carlasc.cli.grid_flags import GridFlags
+from carlasc.cli.library import Given, Library
+from carlasc.core.choices import LidarName
+from carlasc.errors import ArgumentError
 from carlasc.errors import count as count_of  # `count` is an option
 
 
@@ -29,7 +32,12 @@ def simulate(
             help="What is simulated: town, or a simulator of another package.", metavar="NAME"
         ),
     ] = "town",
+    lidar: Annotated[
+        LidarName,
+        typer.Option(help="Model of the LiDARs. --channels, --points and --range change it."),
+    ] = "carlasc",
     grid: GridFlags,
+    effects: Annotated[Given, Library("carlasc.captures.LidarEffects")],
     json: Json = False,
     sensors: SensorFlags,
     run: PartFlags,
@@ -41,15 +49,24 @@ def simulate(
     sensor and the ground truth of all sensors are written instead of a raw capture. A second run
     with the same options writes only the missing frames.
     """
-    drive = {"count": count, "first_frame": first_frame, **sensors.arguments()}
+    drive = {"count": count, "first_frame": first_frame, **sensors.drive.values}
     drive["cameras"] = camera_names(cameras)
+    drive["lidar"] = carlasc.captures.Lidar.named(lidar, **sensors.lidar.values)
     if not grid.is_given and PurePosixPath(out).suffix != ".zarr":
+        if effects.is_given:
+            raise ArgumentError(
+                min(effects.values),
+                expected="a grid, or OUT a .zarr store: raw captures are ideal",
+                found=f"OUT {out}",
+                advice="add --res 0.4",
+            )
         with run.spread("simulate") as spread:
             written = carlasc.simulate(out, simulator=simulator, **drive, run=spread)
         print_json(written) if json else _print_capture(written)
         return
     spec = grid.spec_or_published()
-    simulated = carlasc.captures.load_recorder(simulator, carlasc.captures.Simulator)(**drive)
+    recorder = carlasc.captures.load_recorder(simulator, carlasc.captures.Simulator)
+    simulated = recorder(**drive, effects=effects.make())
     with run.spread("simulate") as spread:
         made = carlasc.regrid(simulated, spec, out, run=spread)
     print_frames(made, made.grids, f"{made.spec}: made", json=json)

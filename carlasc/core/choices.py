@@ -43,6 +43,9 @@ content where these differ, by content, or not at all.
 TrafficLevel = Literal["light", "medium", "heavy"]
 """Amount of simulated traffic."""
 
+LidarName = Literal["carlasc", "hdl-64e", "vlp-16", "os1-128", "pandar64", "mid-360"]
+"""Models of simulated LiDARs."""
+
 SplitName = Literal["train", "val", "test", "all"]
 """Which sequences of a data set are converted."""
 

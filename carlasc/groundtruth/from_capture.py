@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from carlasc.captures.raw import Capture, CaptureFiles, SensorRecording, find_captures
+from carlasc.captures.settings import LidarEffects
 from carlasc.captures.simulation import Simulator
 from carlasc.core.arrays import AnyArray, FloatArray
 from carlasc.core.geometry import relative_to
@@ -49,24 +50,25 @@ class CaptureFrame(FrameInput):
         capture, frame = self.capture, self.source_frame
         bev = ("bev",) if capture.has_bev(frame) else ()
         images = capture.image_fields(frame) if capture.cameras else ()
-        return ("points", "labels", "flow", "instances", *bev, *images)
+        return ("points", "labels", "flow", "instances", *capture.effects.fields, *bev, *images)
 
     def views(self) -> Views:
         """Return the cameras of the capture: their images are taken at the instant of the frame."""
         return [(camera, camera.sensor_T_camera) for camera in self.capture.cameras.values()]
 
     def make(self, plan: GridPlan) -> FrameData:
-        """Read the ego sensor's recording, which is the scan, and count the votes of all sensors.
+        """Read the scan of the ego sensor, and count the votes of all sensors.
 
         The other recordings are read one at a time, so memory does not grow with the number of
         sensors.
         """
-        ego = self.capture.read(self.sensors[0], self.source_frame)
+        seen = self.capture.read_scan(self.source_frame)
         fields: dict[str, AnyArray] = {
-            "points": np.column_stack([ego.scan.points, np.zeros(len(ego.scan), np.float32)]),
-            "labels": _present(ego.scan.labels),
-            "flow": ego.flow(),
-            "instances": _present(ego.scan.instances),
+            "points": np.column_stack([seen.scan.points, np.zeros(len(seen.scan), np.float32)]),
+            "labels": _present(seen.scan.labels),
+            "flow": seen.flow(),
+            "instances": _present(seen.scan.instances),
+            **{name: seen.scan.others[name] for name in self.capture.effects.fields},
         }
         picture = self.capture.read_bev(self.source_frame)
         if picture is not None:
@@ -79,10 +81,13 @@ class CaptureFrame(FrameInput):
             if plan.voting.keep_actors
             else None
         )
-        seen = self._observations(ego, who)
+        # votes are of ideal scans
+        plain = self.capture.effects == LidarEffects()
+        ego = seen if plain else self.capture.read(0, self.source_frame)
+        observations = self._observations(ego, who)
         boxes = plan.voting.keep_seen
         votes = count_votes(
-            seen, plan.spec, classes, rule=plan.rule, free_step_m=step, keep_boxes=boxes
+            observations, plan.spec, classes, rule=plan.rule, free_step_m=step, keep_boxes=boxes
         )
         grid = votes.to_grid()
         actors = None if who is None else who.of(grid.labels)
@@ -166,7 +171,7 @@ class CaptureSequence(SequenceInput):
         )
 
     def _count_points(self, source_frame: int) -> int:
-        return len(self.capture.read(0, source_frame).scan)
+        return len(self.capture.read_scan(source_frame).scan)
 
     def poses(self) -> FloatArray:
         """Return inv(pose0[first]) @ pose0[f] for each frame f.

@@ -21,7 +21,14 @@ from carlasc.captures.settings import (
     sensor_offsets,
 )
 from carlasc.captures.writing import CaptureWriter, TimesLog
-from carlasc.errors import ConflictError, MissingDataError, check_choice, check_types, import_extra
+from carlasc.errors import (
+    ArgumentError,
+    ConflictError,
+    MissingDataError,
+    check_choice,
+    check_types,
+    import_extra,
+)
 from carlasc.storage.camera_files import cameras_to_json
 from carlasc.storage.files import AnyPath
 from carlasc.storage.layout import CAMERAS
@@ -123,15 +130,16 @@ def record(
     check_at_least(1, count=count, sensors=sensors)
     check_at_least(0, seed=seed)
     check_choice("traffic", traffic, TrafficLevel)
+    lidar = lidar or Lidar()
+    if lidar.scattered or lidar.elevations_deg:
+        raise ArgumentError("lidar", expected="equal angles between channels", found=str(lidar))
     models = roof_cameras(cameras)
     images = photo_fields(models, CAMERA_KINDS)
     if bev or cameras:
         import_extra("PIL.Image", "carla")
     writer, written = CaptureWriter(out), 0
     with Server(server, carla) as connection:
-        settings = _ServerSettings(
-            town, traffic, sensors, seed, bev, connection.version, lidar or Lidar()
-        )
+        settings = _ServerSettings(town, traffic, sensors, seed, bev, connection.version, lidar)
         written_settings = dataclasses.asdict(settings) | (
             {"cameras": list(cameras)} if cameras else {}
         )

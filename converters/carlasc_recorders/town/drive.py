@@ -7,7 +7,7 @@ so any frame can be made separately, in any process, with the same bytes.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -19,11 +19,12 @@ from carlasc.captures.settings import (
     EGO_SENSOR_M,
     HEIGHTS_M,
     Lidar,
+    LidarEffects,
     TrafficLevel,
     check_at_least,
     sensor_offsets,
 )
-from carlasc.core.arrays import FloatArray, IntArray, Uint32Array
+from carlasc.core.arrays import FloatArray, Uint32Array
 from carlasc.core.geometry import (
     Transform,
     invert,
@@ -35,7 +36,8 @@ from carlasc.core.geometry import (
 from carlasc.core.scans import Scan
 from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc_recorders.town.actors import EGO_ID, Population, TownActor
-from carlasc_recorders.town.meshes import Mesh, RayScene, concatenate, rotate_exactly
+from carlasc_recorders.town.meshes import Mesh, RayScene, concatenate
+from carlasc_recorders.town.returns import NO_SURFACE, Luck, cast
 from carlasc_recorders.town.town import Town, build_town
 
 REFERENCE_OFFSET_M = (
@@ -170,7 +172,13 @@ class TownDrive:
         return replace(recording.scan, flow=recording.flow())
 
     def sweep(
-        self, frame: int, sensor: int = 0, *, parts: int = 20, phase: float = 0.0
+        self,
+        frame: int,
+        sensor: int = 0,
+        *,
+        parts: int = 20,
+        phase: float = 0.0,
+        effects: LidarEffects = LidarEffects(),  # noqa: B008 (frozen)
     ) -> SensorRecording:
         """Return the recording of a sensor that turns once while everything moves.
 
@@ -184,6 +192,8 @@ class TownDrive:
             sensor: number of the sensor.
             parts: number of parts of the turn; the rays of a part are cast at one instant.
             phase: part of a turn by which its begin is after azimuth -pi, from 0 to 1.
+            effects: what makes the scan differ from that of an ideal LiDAR; `turning` has no
+                meaning here.
 
         Raises:
             ArgumentError: the frame or the sensor is negative, or there is no part.
@@ -191,11 +201,10 @@ class TownDrive:
         check_at_least(0, sensor=sensor)
         check_at_least(1, parts=parts)
         now, offset = self.snapshot(frame), translation(self.sensor_offsets(sensor + 1)[sensor])
-        columns, rays = self.lidar.points // self.lidar.channels, len(self.lidar.directions)
-        part_of = ((np.arange(rays) % columns / columns - phase) % 1.0 * parts).astype(np.int64)
+        directions = self.lidar.directions_of(frame)
+        part_of = ((self.lidar.phases - phase) % 1.0 * parts).astype(np.int64)
         seconds = ((np.arange(parts) + 0.5) / parts - 0.5) * FRAME_PERIOD_S
-        bound, rng = self.lidar.noise_m, self._random(_NOISE, frame, sensor)
-        noise = rng.uniform(-bound, bound, (rays, 3))
+        luck = Luck.draw(self.lidar, effects, self._random(_NOISE, frame, sensor))
         paths = self._paths(frame, seconds)
         static = [actor for id, actor in now.actors.items() if id not in paths]
         world = self._place(frame, now.world_T_ego, static)
@@ -206,7 +215,10 @@ class TownDrive:
             ]
             moving = self._place(frame, paths[EGO_ID][part], moved, with_town=False)
             then = moving.world_T_ego @ offset
-            scan = _cast((world, moving), then, self.lidar, noise, np.flatnonzero(part_of == part))
+            rays = np.flatnonzero(part_of == part)
+            scan = _scan(
+                (world, moving), then, self.lidar, directions[rays], luck.take(rays), effects
+            )
             pose_T_then = invert(pose) @ then
             points = transform_points(pose_T_then, scan.points).astype(np.float32)
             origins = np.tile(pose_T_then[:3, 3].astype(np.float32), (len(scan), 1))
@@ -344,38 +356,29 @@ def scan_snapshot(
         lidar: model of the LiDAR.
         rng: source of the noise.
     """
-    noise = rng.uniform(-lidar.noise_m, lidar.noise_m, lidar.directions.shape)
-    scan = _cast((snapshot,), world_T_sensor, lidar, noise)
+    luck = Luck.draw(lidar, LidarEffects(), rng)
+    directions = lidar.directions_of(snapshot.frame)
+    scan = _scan((snapshot,), world_T_sensor, lidar, directions, luck)
     return SensorRecording(scan, world_T_sensor, _velocities(snapshot, world_T_sensor, scan))
 
 
-def _cast(
-    snapshots: Iterable[Snapshot],
+def _scan(
+    snapshots: Sequence[Snapshot],
     world_T_sensor: Transform,
     lidar: Lidar,
-    noise: FloatArray,
-    chosen: IntArray | slice = slice(None),
+    directions: FloatArray,
+    luck: Luck,
+    effects: LidarEffects = LidarEffects(),  # noqa: B008 (frozen)
 ) -> Scan:
-    """Return the scan of some rays of a LiDAR, which end at the nearest hit in several snapshots,
-    without points on the ego vehicle and unlabelled ones.
+    """Return the scan of (R, 3) rays, without points on the ego vehicle, and without unlabelled
+    ones, unless they are of no surface.
     """
-    directions, noise = lidar.directions[chosen], noise[chosen]
-    world_rays = rotate_exactly(world_T_sensor, directions)
-    hits = []
-    for one in snapshots:
-        rays, triangles, distances = one.scene.cast(
-            world_T_sensor[:3, 3], world_rays, lidar.range_m
-        )
-        hits.append((rays, distances, one.mesh.labels[triangles], one.instances[triangles]))
-    rays, distances, labels, instances = (np.concatenate(part) for part in zip(*hits, strict=True))
-    order = np.lexsort((distances, rays))
-    nearest = order[np.unique(rays[order], return_index=True)[1]]
-    keep = nearest[(instances[nearest] != EGO_ID) & (labels[nearest] != 0)]
-    rays, distances, labels, instances = (
-        values[keep] for values in (rays, distances, labels, instances)
-    )
-    points = (directions[rays] * distances[:, None] + noise[rays]).astype(np.float32)
-    return Scan(points, labels.astype(np.uint32), None, instances)
+    found = cast(snapshots, world_T_sensor, directions, lidar, effects, luck)
+    found = found.take((found.instances != EGO_ID) & (found.labels != 0))
+    distances, rays = found.distances * luck.scale[found.rays], found.rays
+    points = (directions[rays] * distances[:, None] + luck.noise[rays]).astype(np.float32)
+    labels = np.where(found.labels == NO_SURFACE, 0, found.labels).astype(np.uint32)
+    return Scan(points, labels, None, found.instances)
 
 
 def _velocities(snapshot: Snapshot, world_T_sensor: Transform, scan: Scan) -> FloatArray:

@@ -300,10 +300,10 @@ class RayScene:
     def cast(
         self, origin: FloatArray, directions: FloatArray, range_m: float
     ) -> tuple[NDArray[np.intp], Int32Array, FloatArray]:
-        """Cast rays from one point.
+        """Cast rays.
 
         Args:
-            origin: (3,) metres.
+            origin: (3,) or (R, 3) metres.
             directions: (R, 3) unit vectors.
             range_m: maximum distance of a hit, metres.
 
@@ -312,17 +312,17 @@ class RayScene:
             triangles: (H,) index of the first triangle that each of them hits.
             distances: (H,) metres.
         """
-        start = np.broadcast_to((origin - self._centre).astype(np.float32), directions.shape)
+        starts = np.broadcast_to(origin - self._centre, directions.shape)
         limits = np.full(len(directions), range_m, np.float32)
         first_hits = self._scene.run(
-            np.ascontiguousarray(start), directions.astype(np.float32), limits
+            np.ascontiguousarray(starts, np.float32), directions.astype(np.float32), limits
         )
         rays = np.flatnonzero(first_hits >= 0)
         triangles = first_hits[rays]
         x, y, z = (self._normals[triangles, axis] for axis in range(3))
         # Embree returns the triangle only. The distance to its plane is computed here in double
         # precision.
-        start_x, start_y, start_z = origin - self._centre
+        start_x, start_y, start_z = starts[rays].T
         height = self._offsets[triangles] - (x * start_x + y * start_y + z * start_z)
         with np.errstate(divide="ignore", invalid="ignore"):
             slope = x * directions[rays, 0] + y * directions[rays, 1] + z * directions[rays, 2]

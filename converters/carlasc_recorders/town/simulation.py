@@ -9,7 +9,14 @@ from functools import lru_cache
 import numpy as np
 
 from carlasc.captures.raw import SensorRecording
-from carlasc.captures.settings import BEV_HEIGHT_M, BEV_QUALITY, BEV_SIZE, Lidar, TrafficLevel
+from carlasc.captures.settings import (
+    BEV_HEIGHT_M,
+    BEV_QUALITY,
+    BEV_SIZE,
+    Lidar,
+    LidarEffects,
+    TrafficLevel,
+)
 from carlasc.captures.simulation import Simulator
 from carlasc.core.arrays import FloatArray, Uint8Array
 from carlasc.core.cameras import CameraModel
@@ -73,6 +80,14 @@ class SimulatedCapture(Simulator):
         """Simulate the recording of a sensor in a frame."""
         self.check_frame(frame)
         return self._drive.record(frame, sensor)
+
+    def read_scan(self, frame: int) -> SensorRecording:
+        """Simulate the scan of the ego sensor with its effects."""
+        self.check_frame(frame)
+        if self.effects == LidarEffects():
+            return self.read(0, frame)
+        parts = 20 if self.effects.turning else 1
+        return self._drive.sweep(frame, parts=parts, effects=self.effects)
 
     def read_velocities(self, frame: int) -> dict[int, FloatArray]:
         """Return the (3,) velocity over ground, m/s, world frame, of each actor of the town in a

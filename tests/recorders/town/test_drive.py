@@ -12,6 +12,8 @@ from carlasc_recorders.town.drive import Snapshot, TownDrive, scan_snapshot
 from carlasc_recorders.town.meshes import MeshBuilder, RayScene
 from helpers.errors import raises
 
+from carlasc.captures import LidarEffects
+from carlasc.core.arrays import FloatArray
 from carlasc.core.geometry import invert, rotate_vectors, rotation_z, transform_points, translation
 from carlasc.core.scans import Scan
 from carlasc.core.tables import CARLA
@@ -393,3 +395,74 @@ def test_a_sweep_sees_each_direction_at_its_time(drive: TownDrive) -> None:
     assert np.linalg.norm(last[0]) == pytest.approx(0.45 * driven, abs=0.02)
     with raises(ArgumentError, where="parts"):
         drive.sweep(20, parts=0)
+
+
+def disturbed(drive: TownDrive, parts: int = 1, **effects: Any) -> Scan:
+    return drive.sweep(20, parts=parts, effects=LidarEffects(**effects)).scan
+
+
+def far(scan: Scan) -> FloatArray:
+    return np.linalg.norm(scan.points, axis=1)
+
+
+def test_rays_drop_out(drive: TownDrive) -> None:
+    whole, some = disturbed(drive), disturbed(drive, drop_outs=0.25)
+    assert len(some) == pytest.approx(0.75 * len(whole), rel=0.03)
+    points = set(map(bytes, whole.points))
+    assert all(bytes(point) in points for point in some.points[::50])
+
+
+def test_noise_grows_with_the_distance(drive: TownDrive) -> None:
+    whole, noisy = disturbed(drive), disturbed(drive, range_noise=0.01)
+    error = far(noisy) / far(whole) - 1
+    assert np.std(error) == pytest.approx(0.01, rel=0.05)
+    directions = whole.points / far(whole)[:, None], noisy.points / far(noisy)[:, None]
+    assert (directions[0] * directions[1]).sum(axis=1).min() > 0.9999
+
+
+def test_second_returns_lie_behind_or_before_the_first_at_edges(drive: TownDrive) -> None:
+    whole, both = disturbed(drive), disturbed(drive, second_returns=True)
+    np.testing.assert_array_equal(both.points[: len(whole)], whole.points)
+    second = both.points[len(whole) :]
+    assert 0.003 < len(second) / len(whole) < 0.1
+    towards = second / np.linalg.norm(second, axis=1, keepdims=True)
+    seen = whole.points / far(whole)[:, None]
+    for ray, distance in zip(towards[::20], np.linalg.norm(second[::20], axis=1), strict=True):
+        near = (seen @ ray) > np.cos(0.02)
+        assert np.abs(far(whole)[near] - distance).max() > 0.4
+
+
+def test_mirrors_show_unlabelled_points_behind_them(drive: TownDrive) -> None:
+    mirrored = disturbed(drive, reflections=1.0)
+    assert not np.isin(mirrored.labels, [CARLA.id_of("Building"), CARLA.id_of("Vehicle")]).any()
+    ghosts = mirrored.labels == 0
+    assert not mirrored.instances[ghosts].any()
+    # a mirror shows things farther away than itself
+    quiet = copy(drive)
+    quiet.lidar = replace(drive.lidar, noise_m=0.0)
+    first, ghost = disturbed(quiet), disturbed(quiet, reflections=1.0)
+    rays = {tuple((p / r).round(5)): r for p, r in zip(first.points, far(first), strict=True)}
+    behind = [
+        r - rays[key]
+        for p, r, label in zip(ghost.points, far(ghost), ghost.labels, strict=True)
+        if label == 0 and (key := tuple((p / r).round(5))) in rays
+    ]
+    assert len(behind) > 200
+    assert min(behind) > 0
+
+
+def test_rain_ends_some_rays_in_the_air(drive: TownDrive) -> None:
+    wet = disturbed(drive, rain=0.1)
+    drops = wet.labels == 0
+    rays = len(drive.lidar.directions)
+    assert 0.05 * rays < np.count_nonzero(drops) < 0.1 * rays
+    assert 0 < far(wet)[drops].min() < far(wet)[drops].mean() < 5
+
+
+def test_effects_are_the_same_each_time_and_without_them_nothing_changes(drive: TownDrive) -> None:
+    every = {"drop_outs": 0.1, "range_noise": 0.001, "second_returns": True}
+    every |= {"reflections": 0.2, "rain": 0.02}
+    one, two = (disturbed(drive, parts=8, **every) for _ in range(2))
+    np.testing.assert_array_equal(one.points, two.points)
+    np.testing.assert_array_equal(one.others["seconds"], two.others["seconds"])
+    np.testing.assert_array_equal(disturbed(drive).points, drive.sweep(20, parts=1).scan.points)

@@ -437,3 +437,39 @@ def test_the_upper_edge_is_ahead_and_the_picture_is_90_degrees_wide(
     middle = np.argwhere(shown).mean(axis=0)
     assert np.abs(middle - (row, column)).max() < 3
     assert shown.sum() == pytest.approx((4 * 19.2) ** 2, rel=0.1)
+
+
+EFFECTS = (
+    "--turning --drop-outs 0.1 --range-noise 0.001 --second-returns --reflections 0.2 --rain 0.02"
+)
+
+
+def test_effects_change_the_scans_and_not_the_ground_truth(tmp_path: Path) -> None:
+    options = (
+        "--lidar vlp-16 --points 8000 --sensors 2 --count 1 --no-bev --traffic light --res 0.4"
+    )
+    for name, effects in (("ideal", ""), ("real", EFFECTS)):
+        done = CliRunner().invoke(
+            app, ["simulate", str(tmp_path / name), *options.split(), *effects.split()]
+        )
+        assert done.exit_code == 0, done.output
+    ideal, real = (
+        next(iter(carlasc.open(tmp_path / name).sequences().values())) for name in ("ideal", "real")
+    )
+    (name,) = ideal.grids
+    grids = ideal.grid(name, 0), real.grid(name, 0)
+    np.testing.assert_array_equal(grids[0].labels, grids[1].labels)
+    np.testing.assert_array_equal(grids[0].counts, grids[1].counts)
+    assert "seconds" not in ideal.fields()
+    seconds, labels = real.read("seconds", 0), real.read("labels", 0)
+    assert len(seconds) == len(labels) == len(real.read("origins", 0))
+    assert seconds.min() < -0.04 < 0.04 < seconds.max()
+    assert 0.02 < (labels == 0).mean() < 0.2
+    assert (ideal.read("labels", 0) != 0).all()
+
+
+def test_a_raw_capture_takes_no_effects(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["simulate", str(tmp_path / "raw"), "--rain", "0.1"])
+    assert done.exit_code == 2
+    assert "--rain" in done.output
+    assert not list(tmp_path.iterdir())
