@@ -447,8 +447,8 @@ class FrameTask:
         if voting.keep and data.votes is not None:
             parts["votes"] = data.votes.to_sparse()
         if voting.keep_evidence and evidence is not None:
-            parts |= {part: getattr(evidence, part) for part in layout.EVIDENCE_FIELDS}
-        elif plan.infers and data.flags is not None:
+            parts |= vars(evidence)
+        if (voting.keep_evidence or plan.infers) and data.flags is not None:
             parts["flags"] = data.flags
         if voting.keep_actors and data.actors is not None:
             actors = data.actors.within(labels > 0)  # confidence may have made voxels unknown

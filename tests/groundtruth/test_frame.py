@@ -54,7 +54,7 @@ def merge(feed, actors, frame=NOW, spec=SPEC, evidence=True):
 def at(merged, place):
     """Return the label and the count of the voxel at a place, and its flags."""
     voxel = SPEC.flat_index(np.array([place]))[0]
-    flags = VoxelFlag(int(merged.evidence.flags.reshape(-1)[voxel]))
+    flags = VoxelFlag(int(merged.flags.reshape(-1)[voxel]))
     return (
         int(merged.grid.labels.reshape(-1)[voxel]),
         int(merged.grid.counts.reshape(-1)[voxel]),
@@ -165,14 +165,14 @@ class TestBodies:
         assert other[1] > 0
         assert VoxelFlag.INFERRED in other[2] and VoxelFlag.INFERRED not in seen[2]
         assert VoxelFlag.IN_ACTOR in seen[2] and VoxelFlag.IN_ACTOR in other[2]
-        inside = np.flatnonzero(merged.evidence.flags & VoxelFlag.INFERRED)
-        assert (merged.evidence.flags.reshape(-1)[inside] & VoxelFlag.IN_ACTOR).all()
+        inside = np.flatnonzero(merged.flags & VoxelFlag.INFERRED)
+        assert (merged.flags.reshape(-1)[inside] & VoxelFlag.IN_ACTOR).all()
 
     def test_without_completion_it_stays_unknown(self, tmp_path):
         merged = self.make(tmp_path, complete="seen")
         assert at(merged, (0.3, 3.1, -0.1))[0] == VEHICLE
         assert at(merged, (0.3, 4.9, -0.1))[1] == 0
-        assert not (merged.evidence.flags & VoxelFlag.INFERRED).any()
+        assert not (merged.flags & VoxelFlag.INFERRED).any()
 
     def test_the_usual_shape_closes_the_ends_that_a_mirror_image_does_not_show(self, tmp_path):
         front = (1.75, 4.1, -0.1)
@@ -193,7 +193,7 @@ class TestBodies:
         aims = rng.uniform(-1, 1, (60, 3)) * (self.HALF + 0.2) + (0.0, 4.0, 0.0)
         ends = [tuple(2.5 * aim) for aim in aims]
         merged = self.make(tmp_path / "passed", beyond=[(end, BUILDING) for end in ends])
-        flags = merged.evidence.flags.reshape(-1)
+        flags = merged.flags.reshape(-1)
         completed = (flags & VoxelFlag.INFERRED > 0) & (merged.grid.labels.reshape(-1) > 0)
         size = np.asarray(SPEC.voxel_size)
         samples = np.array(ends)[:, None] * np.linspace(0.01, 0.9, 2000)[:, None]

@@ -25,9 +25,9 @@ GRID = "cartesian/evaluation_8x8x4"
 EVIDENCE = VoxelCertainty(
     np.linspace(0, 1, SPEC.num_voxels).reshape(SPEC.size),
     np.array([(3, 7, 65535), (9, 1, 20000)], field_files.VOTES_DTYPE),
-    np.full(SPEC.size, 5, np.uint8),
     np.full(SPEC.size, 61, np.uint16),
 )
+FLAGS = np.full(SPEC.size, 5, np.uint8)
 
 
 @pytest.fixture
@@ -47,7 +47,9 @@ def known_evidence(monkeypatch):
     """Make every frame give the same evidence."""
     make = ScanFrame.make
     monkeypatch.setattr(
-        ScanFrame, "make", lambda self, plan: replace(make(self, plan), evidence=EVIDENCE)
+        ScanFrame,
+        "make",
+        lambda self, plan: replace(make(self, plan), evidence=EVIDENCE, flags=FLAGS),
     )
 
 
@@ -77,7 +79,7 @@ def test_evidence_is_written_beside_the_grid_also_of_one_that_is_there(drive):
     for part in layout.EVIDENCE_FIELDS:
         field = f"evaluation_8x8x4/{part}"
         assert sequence.frames(field).tolist() == [0, 1, 2]
-        wanted = getattr(EVIDENCE, part)
+        wanted = getattr(EVIDENCE, part, FLAGS)
         assert np.array_equal(
             sequence.read(field, 1), wanted.astype("<f2") if part == "occupied" else wanted
         )

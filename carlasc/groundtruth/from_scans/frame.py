@@ -159,7 +159,7 @@ def merge_frame(
     np.maximum.at(views, votes.occupied["voxel"], votes.occupied["voters"])
     np.maximum(views, made.counts > 0, out=views)  # free space is summed over smaller cells
     views_of_voxels = views.astype(np.uint16).reshape(size)
-    evidence = VoxelCertainty(made.occupied.reshape(size), shares, flags, views_of_voxels)
+    evidence = VoxelCertainty(made.occupied.reshape(size), shares, views_of_voxels)
     return FrameData({}, grid, votes, evidence, who, votes.boxes, flags)
 
 

@@ -38,7 +38,6 @@ from carlasc.core.arrays import (
     Int32Array,
     IntArray,
     LabelArray,
-    Uint8Array,
     Uint16Array,
 )
 from carlasc.core.classes import ClassTable
@@ -183,7 +182,6 @@ class VoxelCertainty:
         classes: (M,) `field_files.VOTES_DTYPE` or `field_files.WIDE_VOTES_DTYPE`, sorted by voxel,
             then by label: the probability of each class if the voxel is occupied, in 1/65535, in
             the column `votes`; only non-zero ones.
-        flags: (X, Y, Z) uint8, sums of `carlasc.VoxelFlag`.
         views: (X, Y, Z) uint16, number of scans that saw the voxel.
 
     Raises:
@@ -192,17 +190,15 @@ class VoxelCertainty:
 
     occupied: AnyFloatArray
     classes: AnyArray
-    flags: Uint8Array
     views: Uint16Array
 
     def __post_init__(self) -> None:
-        for name, array in (("flags", self.flags), ("views", self.views)):
-            if array.shape != self.occupied.shape:
-                raise FormatError(
-                    f"evidence {name}",
-                    expected=f"shape {self.occupied.shape}",
-                    found=str(array.shape),
-                )
+        if self.views.shape != self.occupied.shape:
+            raise FormatError(
+                "evidence views",
+                expected=f"shape {self.occupied.shape}",
+                found=str(self.views.shape),
+            )
 
 
 def class_shares(votes: AnyArray, classes: ClassTable) -> AnyArray:
