@@ -61,6 +61,7 @@ TABLE = {
     "carlasc.export": Shown(hidden="sequences"),
     "carlasc.label_motion": Shown("With --from motion", files="boxes_out"),
     "carlasc.map": Shown(renamed={"cell_m": "--cell"}),
+    "carlasc.LayoutOptions": Shown(files="boxes"),
     "carlasc.MapExtras": Shown(files="mesh distance trajectory boxes_out"),
     "carlasc.RecordingOptions": Shown("Recordings", hidden="options", files="keep"),
     "carlasc.motion.MotionOptions": Shown(

@@ -57,6 +57,7 @@ from carlasc.storage.protocol import Sequence, Sink, Source
 from carlasc.storage.transport.trees import LocalTarget
 
 Grids = GridOptions | Literal["voxels"] | None
+_ONE = "one recording, whole (see `sequences`), as a table of boxes has one frame"
 _GAP = "gap"  # in the record: a frame that failed, and others were finished without it
 _UNKNOWN = "there was no record of what frames were made from, so all were compared"
 _LOOKED_AT = (
@@ -158,6 +159,8 @@ def convert(
             "recordings",
             found="True",
         )
+    if run.is_share and layout.boxes is not None:
+        raise ArgumentError("boxes", expected=_ONE, found="a part, or a list of clips")
     if run.sequences_from is not None and not isinstance(out, Sink):
         places = {"source", "out", "run", "scratch"}
         given = {key: arguments[key] for key in sorted(arguments.keys() - places)}
@@ -173,6 +176,8 @@ def convert(
     recordings = _deal(choose_recordings(found, root, sequences, split), run.part)
     if isinstance(grids, GridOptions):
         _check_rays(recordings)
+    if layout.boxes is not None and len(recordings) > 1:
+        raise ArgumentError("boxes", expected=_ONE, found=f"{len(recordings)}")
     has_voxels, chosen = isinstance(grids, str), FrameRange.of(frames)
     plans = []
     for one in recordings:  # in Python 3.11, a comprehension is a level of calls
@@ -183,7 +188,8 @@ def convert(
     if isinstance(grids, GridOptions) and isinstance(grids.observe, FromScans):
         for plan in plans:
             plan.max_range_m = grids.observe.max_range_m
-    states = None if compare == "never" else source_states(root, found, options)
+    read = {**(options or {}), **({} if layout.boxes is None else {"boxes": layout.boxes})}
+    states = None if compare == "never" else source_states(root, found, read)
     records = []
     for plan in plans:
         own = None if states is None else states[None] | states.get(plan.recording.location, {})

@@ -31,6 +31,8 @@ BOX_ENDINGS = (".csv", ".json", ".parquet")
 _NUMBERS = "x y z length width height heading vx vy vz confidence".split()
 _COLUMNS = ("time", "number", "class", *_NUMBERS)
 _DEFAULTS = {"vx": np.nan, "vy": np.nan, "vz": np.nan, "confidence": 1.0}  # of absent columns
+_APART_S = 0.05  # boxes that are farther from the time of a frame are not of it
+_FARTHEST_M = 500.0  # boxes farther from the sensor are of another drive
 
 
 @dataclass(frozen=True)
@@ -152,6 +154,44 @@ class BoxTable:
             return cls(times, numbers, tuple(str(row["class"]) for row in rows), np.array(values))
         except FormatError as error:
             raise error.within(path) from error
+
+    def frames_of(self, times: FloatArray, poses: FloatArray, where: str, drive: str) -> IntArray:
+        """Return (R,) the index of the frame of each box: the nearest in time, -1 without one
+        within 0.05 s. Of several boxes of an object, only the nearest in time is of a frame.
+
+        Args:
+            times: (F,) seconds of the frames, increasing.
+            poses: (F, 4, 4) world_T_sensor, in the frame of the table.
+            where: the file of the table, for errors.
+            drive: the sequence, for errors.
+
+        Raises:
+            FormatError: no box is at the time of a frame, or none is within 500 m of the sensor.
+        """
+        index = np.searchsorted((times[1:] + times[:-1]) / 2, self.times)
+        apart = np.abs(times[index] - self.times)
+        order = np.argsort(apart, kind="stable")
+        keys = np.stack([index, self.numbers])[:, order]
+        kept = order[np.unique(keys, axis=1, return_index=True)[1]]
+        kept = kept[apart[kept] < _APART_S]
+        away = np.linalg.norm(self.values[kept, :3] - poses[index[kept], :3, 3], axis=1)
+        nearest = away.min(initial=np.inf)
+        if nearest > _FARTHEST_M:
+            expected = f"boxes within {_FARTHEST_M:g} m of the sensor of {drive}"
+            found, unit = f"none: the nearest is {nearest:.0f} m away", "the frame of its poses"
+            if not len(kept):
+                expected = f"times of {drive}, {times[0]:g} to {times[-1]:g} s"
+                found = f"{self.times.min():g} to {self.times.max():g} s"
+                unit = "seconds since its first frame"
+            raise FormatError(
+                where,
+                expected=expected,
+                found=found,
+                advice=f"give the boxes of this sequence, in {unit}",
+            )
+        frames = np.full(len(index), -1)
+        frames[kept] = index[kept]
+        return frames
 
     def write(self, path: AnyPath) -> None:
         """Write the table; an existing file is replaced.
