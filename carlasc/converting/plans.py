@@ -449,6 +449,8 @@ def plan_recording(
         MissingDataError: the recording has no poses or voxels, although they were requested.
         ConflictError: the output has another grid in the place of the voxels.
     """
+    target = output.of(converter)
+    given = None if output.boxes is None else GivenBoxes.read(output.boxes, target)
     writer = sink.sequence(sequence_path(recording))
     grew = is_provisional(writer)
     known = options.force or (writer.read_document(layout.POSES) is not None and not grew)
@@ -460,11 +462,8 @@ def plan_recording(
             found=problem.found,
             advice=problem.advice,
         )
-    recording, target, given = seen.recording, output.of(converter), None
-    if output.boxes is None:
-        boxes = _read_boxes(recording, target)
-    else:
-        given, boxes = GivenBoxes.read(output.boxes, target), {}
+    recording = seen.recording
+    boxes = _read_boxes(recording, target) if given is None else {}
     plan = RecordingPlan(
         **vars(seen),
         writer=writer,
