@@ -68,6 +68,7 @@ TABLE = {
         "Scans merged over time", hidden="min_speed_m_s", renamed={"source": "--motion"}
     ),
     "carlasc.motion.PoseOptions": Shown("Poses", renamed={"source": "--poses"}),
+    "carlasc.regrid": Shown(files="boxes_out"),
     "carlasc.simulate": Shown("Traffic and sensors"),
     "carlasc.stats": Shown(hidden="remap"),
     "carlasc.view": Shown(renamed={"thin_m": "--thin"}),

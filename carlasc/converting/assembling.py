@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 
@@ -35,7 +34,6 @@ from carlasc.errors import (
     describe,
     first_names,
 )
-from carlasc.motion.box_table import check_box_file
 from carlasc.motion.odometry import move_each, ticks_of
 from carlasc.storage import layout
 from carlasc.storage.files import AnyPath
@@ -90,8 +88,6 @@ class LayoutOptions:
         check_choice("images", self.images, Images)
         check_choice("flow", self.flow, FlowSource)
         check_choice("compare_inputs", self.compare_inputs, CompareInputs)
-        if self.boxes is not None:
-            check_box_file("boxes", Path(self.boxes))
 
     def of(self, converter: Converter) -> AxesAndClasses:
         """Return the axes and the classes in which the data of a converter are written.

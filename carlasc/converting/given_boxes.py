@@ -13,7 +13,7 @@ from carlasc.converting.protocol import Recording
 from carlasc.core.arrays import FloatArray, Uint32Array
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import invert
-from carlasc.errors import CarlascError, FormatError, first_names
+from carlasc.errors import ArgumentError, CarlascError, FormatError, first_names
 from carlasc.motion.box_table import BoxTable
 from carlasc.storage.files import AnyPath
 
@@ -44,17 +44,12 @@ class GivenBoxes:
             MissingDataError: there is no such file.
             FormatError: a box is not valid, or has an unknown class.
         """
-        table, names = BoxTable.read(path), target.classes.names
-        known = {name.lower(): label for label, name in names.items() if label}
-        for row, name in enumerate(table.classes):
-            if name.lower() not in known:
-                raise FormatError(
-                    f"{path}: row {row + 1}",
-                    expected=f"a class of {target.classes.name}: {', '.join(known)}",
-                    found=repr(name),
-                    advice="rename it",
-                )
-        return cls(table, str(path), np.array([known[n.lower()] for n in table.classes], np.uint32))
+        table = BoxTable.read(path)
+        try:
+            labels = [target.classes.id_of(name) for name in table.classes]
+        except ArgumentError as error:
+            raise FormatError(path, expected=error.expected, found=error.where) from error
+        return cls(table, str(path), np.array(labels, np.uint32))
 
     def at_scans(
         self, recording: Recording, times: FloatArray, first_T_scan: FloatArray, *, check: bool
@@ -93,17 +88,14 @@ class GivenBoxes:
 
     def _check_points(self, recording: Recording, boxes: dict[int, Boxes]) -> None:
         """Check that some scans have points in boxes near the sensor."""
-        near = {
-            number: own.select(np.linalg.norm(own.centers, axis=1) < _NEAR_M)
-            for number, own in boxes.items()
-        }
-        handles = [one for one in recording.frames if len(near.get(one.number, ()))]
+        handles = [one for one in recording.frames if one.number in boxes]
         rig, held = Rig.of(recording), np.zeros(0, np.bool_)
-        for row in sorted({*np.linspace(0, len(handles) - 1, _SCANS).astype(int).tolist()}):
+        for handle in handles[:: -(-len(handles) // _SCANS)]:
+            own = boxes[handle.number]
+            near = own.select(np.linalg.norm(own.centers, axis=1) < _NEAR_M)
             with suppress(CarlascError, OSError):  # the conversion of the frame reports the error
-                points = read_scan(handles[row], rig, None).points[:, :3]
-                own = near[handles[row].number].contains(points).any(axis=1)
-                held = np.append(held, own)
+                points = read_scan(handle, rig, None).points[:, :3]
+                held = np.append(held, near.contains(points).any(axis=1))
         if len(held) and held.mean() < _HELD:
             raise FormatError(
                 self.where,

@@ -38,6 +38,7 @@ from carlasc.groundtruth.inputs import remove_provisional
 from carlasc.groundtruth.options import FromScans, GridOptions, Voting, fit_to_ground, fit_to_reach
 from carlasc.groundtruth.run import regrid
 from carlasc.inspection.findings import Finding
+from carlasc.motion.box_table import check_box_file
 from carlasc.motion.ground import Ground, joined
 from carlasc.motion.options import PoseOptions
 from carlasc.running.processes import one_pool
@@ -57,7 +58,6 @@ from carlasc.storage.protocol import Sequence, Sink, Source
 from carlasc.storage.transport.trees import LocalTarget
 
 Grids = GridOptions | Literal["voxels"] | None
-_ONE = "one recording, whole (see `sequences`), as a table of boxes has one frame"
 _GAP = "gap"  # in the record: a frame that failed, and others were finished without it
 _UNKNOWN = "there was no record of what frames were made from, so all were compared"
 _LOOKED_AT = (
@@ -159,8 +159,8 @@ def convert(
             "recordings",
             found="True",
         )
-    if run.is_share and layout.boxes is not None:
-        raise ArgumentError("boxes", expected=_ONE, found="a part, or a list of clips")
+    if run.sequences_from is not None and layout.boxes is not None:
+        raise ArgumentError("boxes", expected="one recording", found="a list of clips")
     if run.sequences_from is not None and not isinstance(out, Sink):
         places = {"source", "out", "run", "scratch"}
         given = {key: arguments[key] for key in sorted(arguments.keys() - places)}
@@ -173,11 +173,12 @@ def convert(
     check_arguments(root, sink, split, grids)
     compare = layout.compare_inputs
     found = find_recordings(converter)
-    recordings = _deal(choose_recordings(found, root, sequences, split), run.part)
+    every = choose_recordings(found, root, sequences, split)
+    if layout.boxes is not None:
+        check_box_file("boxes", Path(layout.boxes), len(every))
+    recordings = _deal(every, run.part)
     if isinstance(grids, GridOptions):
         _check_rays(recordings)
-    if layout.boxes is not None and len(recordings) > 1:
-        raise ArgumentError("boxes", expected=_ONE, found=f"{len(recordings)}")
     has_voxels, chosen = isinstance(grids, str), FrameRange.of(frames)
     plans = []
     for one in recordings:  # in Python 3.11, a comprehension is a level of calls
@@ -197,9 +198,9 @@ def convert(
         records[-1].begin(compare)
     metadata = describe(converter, name, layout)
 
-    every = sum(len(plan.recording.frames) for plan in plans)
-    in_grids = every if isinstance(grids, GridOptions) else 0
-    steps = StepCounter(run.progress, every + in_grids)
+    scans = sum(len(plan.recording.frames) for plan in plans)
+    in_grids = scans if isinstance(grids, GridOptions) else 0
+    steps = StepCounter(run.progress, scans + in_grids)
     with one_pool(run) as pooled:
         conversions = [
             Conversion(plan, converter, target, layout.images, pooled, steps, layout.allow_gaps)
@@ -219,11 +220,11 @@ def convert(
             # without the motion that some frames wait for, grids would be made in another way
             converted = [one for one in conversions if one.has_scans and not one.waits]
             if converted:  # otherwise every frame failed, and is reported
-                scans = _ConvertedScans(sink, converted)
-                spec, observe, cut = plan_grids(grids, converted, scans, poses)
+                written = _ConvertedScans(sink, converted)
+                spec, observe, cut = plan_grids(grids, converted, written, poses)
                 voting = grids.voting or Voting()
                 made = regrid(
-                    scans,
+                    written,
                     spec,
                     out,
                     observe=observe,
@@ -232,7 +233,7 @@ def convert(
                     run=alone,
                 )
                 made = replace(made, notes=(*cut, *made.notes))
-                for sequence in scans.values():
+                for sequence in written.values():
                     remove_provisional(sink.sequence(sequence.path), sequence)
 
     failures = [failure for conversion in conversions for failure in conversion.failures]

@@ -84,7 +84,7 @@ class BoxTable:
         names: Mapping[int, str],
         *,
         left: bool,
-        numbers: Mapping[int, int] | None = None,
+        numbers: Mapping[int, int] = {},
     ) -> Self:
         """Return the boxes of tracks, in order of the tracks, then of time.
 
@@ -93,8 +93,8 @@ class BoxTable:
             frames: seconds by frame.
             names: names of the classes.
             left: whether the axes of the tracks are left-handed.
-            numbers: other numbers of the tracks, by number. Of two boxes of one number in a frame,
-                the one with points is kept.
+            numbers: other numbers of the tracks, by number; empty for the same. Of two boxes of one
+                number in a frame, the one with points is kept.
         """
         signs = (1, -1, 1) if left else (1, 1, 1)
         rows = dict[tuple[int, int], tuple[float, str, FloatArray]]()
@@ -242,10 +242,17 @@ def _rows_of(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def check_box_file(argument: str, path: Path) -> None:
-    """Check, before hours of work, the ending of a file of boxes, and that pyarrow is installed if
-    it is needed; `argument` is named in errors.
+def check_box_file(argument: str, path: Path, sequences: int = 1) -> None:
+    """Check, before hours of work, the ending of a file of boxes, that pyarrow is installed if it
+    is needed, and that the boxes are of one sequence; `argument` is named in errors.
     """
+    if sequences != 1:
+        raise ArgumentError(
+            argument,
+            expected="one sequence with scans, as a table has one frame",
+            found=f"{sequences} sequences",
+            advice="give the folder or the name of one",
+        )
     if path.suffix.lower() not in BOX_ENDINGS:
         expected = f"a file that ends in {', '.join(BOX_ENDINGS)}"
         raise ArgumentError(argument, expected=expected, found=str(path))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.converters.scan_writers import write_poses, write_scan
 from helpers.errors import raises
-from helpers.scenes.passing_car import CAR, SPEED_M_S, scan, sensor_pose, write_sequence
+from helpers.scenes.passing_car import SPEED_M_S, scan, sensor_pose, write_sequence
 from typer.testing import CliRunner
 
 import carlasc
@@ -15,7 +15,6 @@ from carlasc.cli import app
 from carlasc.core.geometry import mirror_poses, transform_points
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.motion import BoxTable, MotionOptions
-from carlasc.running.spreading import Part
 from carlasc.storage import FolderSource
 
 ONE, FRAMES = Run(workers=1), 10
@@ -128,7 +127,7 @@ def test_bad_boxes_are_refused_in_one_line_before_anything_is_written(drive, tmp
         ("no time", "\n".join(line.partition(",")[2] for line in lines), "time absent"),
         ("size", "\n".join([lines[0], ",".join(size)]), "0.0"),
         ("twice", "\n".join([*lines, lines[4]]), "9.0"),
-        ("class", "\n".join(lines).replace("Vehicle", "Spaceship"), "'Spaceship'"),
+        ("class", "\n".join(lines).replace("Vehicle", "Spaceship"), "class 'Spaceship'"),
         ("late", replace(table, times=table.times + 60), "60 to 60.9 s"),
         ("away", replace(table, values=away), "none: the nearest is"),
         ("air", replace(table, values=near), "no point in"),
@@ -145,12 +144,12 @@ def test_bad_boxes_are_refused_in_one_line_before_anything_is_written(drive, tmp
         assert not (tmp_path / "out").exists()
     with raises(ArgumentError, where="boxes", found=str(tmp_path / "boxes.txt")):
         convert(drive, tmp_path / "out", tmp_path / "boxes.txt")
-    with raises(ArgumentError, where="boxes", found="a part"):
+    with raises(ArgumentError, where="boxes", found="a list of clips"):
         carlasc.convert(
             "scans",
-            drive / "scans",
+            drive,
             tmp_path / "out",
             layout=LayoutOptions(boxes=drive / "boxes.csv"),
+            run=Run(sequences_from=tmp_path / "clips.txt"),
             grids=None,
-            run=Run(part=Part(1, 2)),
         )

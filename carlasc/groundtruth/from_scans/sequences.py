@@ -40,6 +40,7 @@ from carlasc.groundtruth.inputs import (
 from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.reporting import PoseFacts, Residual
 from carlasc.motion import ground_points
+from carlasc.motion.box_table import BoxTable
 from carlasc.motion.odometry import estimate_poses
 from carlasc.motion.refinement import MIN_SCANS, RefinedPoses
 from carlasc.motion.tracks import FIRST_FOUND, MovingActors, is_doubtful, is_possible
@@ -283,6 +284,17 @@ class ScanSequence(StoredSequence):
             self.feed = self.feed.with_poses_of(
                 with_refined_poses(self.posed, self.feed.frames, refined)
             )
+
+    def box_table(self, frames: list[int]) -> BoxTable:
+        """Return the boxes of the moving actors, which were found, at some frames."""
+        times = self.feed.sequence.times_of(frames).tolist()
+        return BoxTable.of_tracks(
+            self.actors.tracks,
+            dict(zip(frames, times, strict=True)),
+            self.metadata.classes.names,
+            left=self.metadata.axes == "left",
+            numbers=self.actors.numbers,
+        )
 
     def summaries(self) -> Series[Mapping[str, Any]] | None:
         """Return the facts of each actor, by number; None if actors are not tracked."""

@@ -32,7 +32,6 @@ from carlasc.groundtruth.maps.growing_cells import (
 from carlasc.groundtruth.maps.map_files import ACTORS, MapCells, MapFiles, write_distances
 from carlasc.groundtruth.options import FromScans, Voting
 from carlasc.motion import HORIZON_S, Track
-from carlasc.motion.box_table import BoxTable
 from carlasc.motion.evidence import views_of
 from carlasc.motion.options import MotionOptions, PoseOptions
 from carlasc.motion.parked import (
@@ -91,7 +90,7 @@ def write_map(
         if files.trajectory is not None:
             drive.write_trajectory(files.trajectory)
         if files.boxes is not None:
-            drive.write_boxes(files.boxes)
+            drive.inputs.box_table(drive.frames).write(files.boxes)
         if files.actors is not None and files.out is not None:
             bodies = drive.write_actors(files.actors, files.out.suffix.lower())
     return MapContent(points, len(drive.frames), bodies, drive.parked, drive.notes())
@@ -211,17 +210,6 @@ class DriveMap:
         table = np.column_stack([sequence.times_of(self.frames), poses[:, :3, 3], turns])
         lines = (" ".join(f"{value:.9g}" for value in row) for row in table.tolist())
         write_atomic(path, "".join(f"{line}\n" for line in lines).encode())
-
-    def write_boxes(self, path: Path) -> None:
-        """Write the box of each moving actor at each scan, in order of actors, then of time."""
-        metadata = self.inputs.metadata
-        times = self.inputs.feed.sequence.times_of(self.frames).tolist()
-        BoxTable.of_tracks(
-            self.inputs.actors.tracks,
-            dict(zip(self.frames, times, strict=True)),
-            metadata.classes.names,
-            left=metadata.axes == "left",
-        ).write(path)
 
     def write_actors(self, folder: Path, ending: str) -> int:
         """Write the body of each actor, in its own frame, and its poses; return the number of
