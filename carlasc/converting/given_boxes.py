@@ -19,7 +19,10 @@ from carlasc.storage.files import AnyPath
 
 _SCANS = 5  # scans whose points are looked for in boxes
 _NEAR_M = 30.0  # nearer boxes hold points, unless something hides them
-_HELD = 0.25  # share of the near boxes with points; if it is lower, they are of another drive
+_FLOOR_M = 0.3  # points below are of the ground, which is in boxes of other drives too
+# share of the near boxes with points: 0.97 or more with their own drive, 0.31 or less with another
+# one (towns 51 and 52, streets 201 and 202)
+_HELD = 0.4
 
 
 @dataclass(frozen=True)
@@ -94,8 +97,8 @@ class GivenBoxes:
             own = boxes[handle.number]
             near = own.select(np.linalg.norm(own.centers, axis=1) < _NEAR_M)
             with suppress(CarlascError, OSError):  # the conversion of the frame reports the error
-                points = read_scan(handle, rig, None).points[:, :3]
-                held = np.append(held, near.contains(points).any(axis=1))
+                points = read_scan(handle, rig, None).points[:, :3].astype(np.float64)
+                held = np.append(held, near.contains(points - [0, 0, _FLOOR_M]).any(axis=1))
         if len(held) and held.mean() < _HELD:
             raise FormatError(
                 self.where,

@@ -15,9 +15,9 @@ from carlasc.converting.protocol import Failure, check_outside
 from carlasc.converting.registry import find_recordings, open_converter, readers_of
 from carlasc.converting.run import convert, source_states
 from carlasc.core.frames import FrameRange, Frames
-from carlasc.errors import ArgumentError, CarlascError, MissingDataError, check_types
+from carlasc.errors import ArgumentError, CarlascError, MissingDataError, check_types, only
 from carlasc.groundtruth.maps.map_files import MapFiles
-from carlasc.groundtruth.maps.mapping import only, with_neighbours, write_grid, write_map
+from carlasc.groundtruth.maps.mapping import with_neighbours, write_grid, write_map
 from carlasc.inspection.findings import Finding
 from carlasc.motion.options import MotionOptions, PoseOptions
 from carlasc.running.spreading import Run, StepCounter
@@ -193,7 +193,11 @@ def map(
             if recording.converter is None:
                 error.advice += f', with `converter="{reader}"`'
             raise
-        only(recordings, [one.location for one in recordings])
+        only(
+            "source",
+            {one.location: one for one in recordings},
+            "one recording, as a map has one frame",
+        )
         of_places = source_states(root, recordings, options)
         states = {name: state for of in of_places.values() for name, state in of.items()}
     first, settings = files.all[0], (cell_m, str(wanted), grid, [str(path) for path in files.all])

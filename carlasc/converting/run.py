@@ -33,12 +33,12 @@ from carlasc.converting.stages import Conversion
 from carlasc.core.choices import CompareInputs
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError, MissingDataError, check_choice, check_types
+from carlasc.errors import ArgumentError, MissingDataError, check_choice, check_types, only
 from carlasc.groundtruth.inputs import remove_provisional
 from carlasc.groundtruth.options import FromScans, GridOptions, Voting, fit_to_ground, fit_to_reach
 from carlasc.groundtruth.run import regrid
 from carlasc.inspection.findings import Finding
-from carlasc.motion.box_table import check_box_file
+from carlasc.motion.box_table import ONE_FRAME
 from carlasc.motion.ground import Ground, joined
 from carlasc.motion.options import PoseOptions
 from carlasc.running.processes import one_pool
@@ -175,7 +175,7 @@ def convert(
     found = find_recordings(converter)
     every = choose_recordings(found, root, sequences, split)
     if layout.boxes is not None:
-        check_box_file("boxes", Path(layout.boxes), len(every))
+        only("boxes", {one.name: one for one in every}, ONE_FRAME)
     recordings = _deal(every, run.part)
     if isinstance(grids, GridOptions):
         _check_rays(recordings)

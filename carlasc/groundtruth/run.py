@@ -34,6 +34,7 @@ from carlasc.errors import (
     StorageError,
     check_choice,
     check_types,
+    only,
     reading,
 )
 from carlasc.groundtruth.from_capture import capture_sequences
@@ -51,7 +52,7 @@ from carlasc.groundtruth.inputs import (
 from carlasc.groundtruth.options import FromCapture, FromScans, Observe, Voting
 from carlasc.groundtruth.reporting import Changes, FrameFacts, Report, sample_frames
 from carlasc.groundtruth.seen import check_views, see_voxels
-from carlasc.motion.box_table import check_box_file
+from carlasc.motion.box_table import ONE_FRAME, check_box_file
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run, StepCounter, check_shared
 from carlasc.storage import as_source, layout
@@ -185,7 +186,8 @@ def regrid(
             raise
     merged = [one for one in found if isinstance(one, ScanSequence) and one.feed.needs_actors]
     if boxes_out is not None:
-        check_box_file("boxes_out", Path(boxes_out), len(merged))
+        only("boxes_out", {one.path: one for one in merged}, f"{ONE_FRAME}, with scans that move")
+        check_box_file("boxes_out", Path(boxes_out))
     jobs = [_prepare(one, sink, plan, compare_inputs, overwrite=overwrite) for one in found]
 
     with ExitStack() as open_things:

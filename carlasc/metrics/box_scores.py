@@ -11,7 +11,7 @@ import numpy as np
 from carlasc.core.arrays import BoolArray, FloatArray
 from carlasc.core.boxes import mirror_boxes
 from carlasc.core.geometry import invert, mirror_poses, transform_points
-from carlasc.errors import ArgumentError, MissingDataError, check_types, import_extra
+from carlasc.errors import MissingDataError, check_types, import_extra, only
 from carlasc.metrics.confusion import json_number
 from carlasc.metrics.results import Cell, FigureTable
 from carlasc.motion import BoxTable, tracks_from_boxes
@@ -134,17 +134,11 @@ def evaluate_boxes(
     table = found if isinstance(found, BoxTable) else BoxTable.read(found)
     where = "found" if isinstance(found, BoxTable) else str(found)
     source = as_source(truth)
-    having = [one for one in source.sequences().values() if len(one.frames("boxes"))]
+    having = {path: one for path, one in source.sequences().items() if len(one.frames("boxes"))}
     if not having:
         raise MissingDataError(source, expected="annotated boxes, in the field boxes", found="none")
-    if len(having) > 1:
-        raise ArgumentError(
-            "truth",
-            expected="one sequence with boxes",
-            found=f"{len(having)}",
-            advice="give the folder of one",
-        )
-    sequence, numbers = having[0], having[0].frames("boxes")
+    sequence = only("truth", having, "one sequence with boxes")
+    numbers = sequence.frames("boxes")
     times, frames = sequence.times_of(numbers), numbers.tolist()
     poses = np.stack([sequence.read_pose(frame) for frame in frames])
     boxes = {f: given for f in frames if (given := sequence.boxes(f)) is not None}

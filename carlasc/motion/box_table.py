@@ -13,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 
 from carlasc.core.arrays import FloatArray, IntArray
-from carlasc.core.geometry import transform_points
+from carlasc.core.geometry import Transform, rotate_vectors, transform_points
 from carlasc.errors import (
     ArgumentError,
     FormatError,
@@ -25,6 +25,8 @@ from carlasc.errors import (
 from carlasc.motion.tracks import Track
 from carlasc.storage.files import AnyPath, to_json, write_output
 
+ONE_FRAME = "one sequence, as a table of boxes has one frame"
+"""What is expected of the source, or of the output, of a table."""
 BOX_ENDINGS = (".csv", ".json", ".parquet")
 """Endings of the files of a `BoxTable`."""
 
@@ -80,7 +82,7 @@ class BoxTable:
     def of_tracks(
         cls,
         tracks: Mapping[int, Track],
-        frames: Mapping[int, float],
+        frames: Mapping[int, tuple[float, Transform]],
         names: Mapping[int, str],
         *,
         left: bool,
@@ -90,7 +92,7 @@ class BoxTable:
 
         Args:
             tracks: the tracks by number.
-            frames: seconds by frame.
+            frames: seconds, and (4, 4) table_T_world, by frame.
             names: names of the classes.
             left: whether the axes of the tracks are left-handed.
             numbers: other numbers of the tracks, by number; empty for the same. Of two boxes of one
@@ -99,11 +101,12 @@ class BoxTable:
         signs = (1, -1, 1) if left else (1, 1, 1)
         rows = dict[tuple[int, int], tuple[float, str, FloatArray]]()
         for number, track in tracks.items():
-            for frame, seconds in frames.items():
+            for frame, (seconds, table_T_world) in frames.items():
                 pose, velocity = track.pose(frame), track.velocity_at(frame)
                 key = (numbers[number] if numbers else number, frame)
                 if pose is None or velocity is None or (key in rows and frame not in track.members):
                     continue
+                pose, velocity = table_T_world @ pose, rotate_vectors(table_T_world, velocity)
                 middle = transform_points(pose, (track.lower + track.upper) / 2) * signs
                 ahead, moves = pose[:3, 0] * signs, velocity * signs
                 last = (track.confidence,)
@@ -242,17 +245,10 @@ def _rows_of(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def check_box_file(argument: str, path: Path, sequences: int = 1) -> None:
-    """Check, before hours of work, the ending of a file of boxes, that pyarrow is installed if it
-    is needed, and that the boxes are of one sequence; `argument` is named in errors.
+def check_box_file(argument: str, path: Path) -> None:
+    """Check, before hours of work, the ending of a file of boxes, and that pyarrow is installed if
+    it is needed; `argument` is named in errors.
     """
-    if sequences != 1:
-        raise ArgumentError(
-            argument,
-            expected="one sequence with scans, as a table has one frame",
-            found=f"{sequences} sequences",
-            advice="give the folder or the name of one",
-        )
     if path.suffix.lower() not in BOX_ENDINGS:
         expected = f"a file that ends in {', '.join(BOX_ENDINGS)}"
         raise ArgumentError(argument, expected=expected, found=str(path))

@@ -13,13 +13,13 @@ from carlasc.core.arrays import AnyArray, BoolArray, Float32Array, FloatArray, U
 from carlasc.core.frames import FrameRange
 from carlasc.core.geometry import invert, moved_back, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError, check_types
+from carlasc.errors import ArgumentError, check_types, only
 from carlasc.groundtruth.from_scans.actor_voxels import velocity_at
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
 from carlasc.groundtruth.inputs import GridPlan
 from carlasc.groundtruth.options import FromScans, Voting
-from carlasc.motion.box_table import check_box_file
+from carlasc.motion.box_table import ONE_FRAME, check_box_file
 from carlasc.motion.ground import ground_points
 from carlasc.motion.tracks import MovingActors, Track
 from carlasc.relabelling.copies import timed, write_in_stages
@@ -104,7 +104,8 @@ def label_motion(
     share = Share(as_source(source), run)
     given = sequences_with_scans(share)
     if boxes_out is not None:
-        check_box_file("boxes_out", Path(boxes_out), len(given))
+        only("boxes_out", given, ONE_FRAME)
+        check_box_file("boxes_out", Path(boxes_out))
     inputs = scan_sequences_of(given, observe)
     copy = DerivedCopy(
         share,
