@@ -390,9 +390,12 @@ def only(argument: str, found: Mapping[str, T], expected: str) -> T:
         ArgumentError: there are several, or none; `argument` is named.
     """
     if len(found) != 1:
-        names = f"{len(found)} ({first_names(found, 3)})"
-        advice = "give the folder of one"
-        raise ArgumentError(argument, expected=expected, found=names, advice=advice)
+        raise ArgumentError(
+            argument,
+            expected=expected,
+            found=f"{len(found)} ({first_names(found, 3)})",
+            advice="give the folder of one",
+        )
     return next(iter(found.values()))
 
 

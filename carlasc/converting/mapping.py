@@ -12,7 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.converting.protocol import Failure, check_outside
-from carlasc.converting.registry import find_recordings, open_converter, readers_of
+from carlasc.converting.registry import (
+    find_recordings,
+    load_converter,
+    open_converter,
+    readers_of,
+)
 from carlasc.converting.run import convert, source_states
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.errors import ArgumentError, CarlascError, MissingDataError, check_types, only
@@ -30,7 +35,6 @@ from carlasc.storage.protocol import Source
 from carlasc.storage.transport.trees import is_url
 
 _LEAST_CELL_M = 0.001  # smaller cells are finer than float32 positions
-_BAGS = (".bag", ".db3", ".mcap")
 _ANY_LIDAR = "scans"  # the converter of bare scans, which may also read folders of other data sets
 
 
@@ -292,5 +296,6 @@ def _reader_of(source: AnyPath, grid: str | None) -> str | None:
     if names:
         return names[0]
     place = Path(source)  # what cannot be read says what it expects
-    inner = [place] if place.is_file() else place.iterdir()
-    return "bag" if any(path.suffix in _BAGS or path == place for path in inner) else _ANY_LIDAR
+    bags = load_converter("bag").endings
+    is_bag = place.is_file() or any(path.name.endswith(bags) for path in place.iterdir())
+    return "bag" if is_bag else _ANY_LIDAR

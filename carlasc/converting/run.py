@@ -189,7 +189,7 @@ def convert(
     if isinstance(grids, GridOptions) and isinstance(grids.observe, FromScans):
         for plan in plans:
             plan.max_range_m = grids.observe.max_range_m
-    read = {**(options or {}), **({} if layout.boxes is None else {"boxes": layout.boxes})}
+    read = {**(options or {}), "boxes": layout.boxes}
     states = None if compare == "never" else source_states(root, found, read)
     records = []
     for plan in plans:
