@@ -383,6 +383,22 @@ def first_names(names: Iterable[str], most: int = 8) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
+def only(argument: str, found: Mapping[str, T], expected: str) -> T:
+    """Return the one sequence, or recording, of those that were found, by name.
+
+    Raises:
+        ArgumentError: there are several, or none; `argument` is named.
+    """
+    if len(found) != 1:
+        raise ArgumentError(
+            argument,
+            expected=expected,
+            found=f"{len(found)} ({first_names(found, 3)})",
+            advice="give the folder of one",
+        )
+    return next(iter(found.values()))
+
+
 def runs_of(numbers: Iterable[int]) -> list[tuple[int, int]]:
     """Return the first and the last number of each run of successive numbers."""
     by_run = groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])

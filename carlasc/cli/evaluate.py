@@ -173,36 +173,23 @@ def evaluate(
 
         check_plot(output.plot)  # before anything is counted
     name, common = name or Path(source).name, dict(choice.values)
-    if boxes:
+    if boxes or forecast is not None:
         others = {
-            **common,
-            **scored.values,
-            "convention": convention,
             "all_conventions": all_conventions,
-            "forecast": forecast,
             "compare": compare,
             "per_frame": output.per_frame,
             "plot": output.plot,
         }
+        if boxes:
+            others |= {**common, **scored.values, "convention": convention, "forecast": forecast}
         if refused := [option for option, value in others.items() if value]:
-            raise ArgumentError(refused[0], expected="none with --boxes", found="both")
+            expected = f"none with {'--boxes' if boxes else '--forecast'}"
+            raise ArgumentError(refused[0], expected=expected, found="both", advice="leave one out")
+    if boxes:
         _print_boxes(source, truth, name, region, output)
         return
     scoring: carlasc.Scoring = scored.make(region=region if region.is_given else None)
     if forecast is not None:
-        alone = {
-            "all_conventions": all_conventions,
-            "compare": compare,
-            "per_frame": output.per_frame,
-            "plot": output.plot,
-        }
-        if other_options := [option for option, value in alone.items() if value]:
-            raise ArgumentError(
-                other_options[0],
-                expected="none with --forecast",
-                found="both",
-                advice="leave one out",
-            )
         common |= {"convention": convention, "around": forecast}
         with work.spread("Scoring", usual=1) as run:
             by_time = carlasc.metrics.evaluate_forecasts(

@@ -62,12 +62,14 @@ TABLE = {
     "carlasc.export": Shown(hidden="sequences"),
     "carlasc.label_motion": Shown("With --from motion", files="boxes_out"),
     "carlasc.map": Shown(renamed={"cell_m": "--cell"}),
+    "carlasc.LayoutOptions": Shown(files="boxes"),
     "carlasc.MapExtras": Shown(files="mesh distance trajectory boxes_out"),
     "carlasc.RecordingOptions": Shown("Recordings", hidden="options", files="keep"),
     "carlasc.motion.MotionOptions": Shown(
         "Scans merged over time", hidden="min_speed_m_s", renamed={"source": "--motion"}
     ),
     "carlasc.motion.PoseOptions": Shown("Poses", renamed={"source": "--poses"}),
+    "carlasc.regrid": Shown(files="boxes_out"),
     "carlasc.simulate": Shown("Traffic and sensors"),
     "carlasc.stats": Shown(hidden="remap"),
     "carlasc.view": Shown(renamed={"thin_m": "--thin"}),

@@ -36,6 +36,7 @@ from carlasc.errors import (
 )
 from carlasc.motion.odometry import move_each, ticks_of
 from carlasc.storage import layout
+from carlasc.storage.files import AnyPath
 
 _APART_M = 0.25  # positions of a sensor within a sweep that are closer than this count as one
 _IDS = np.iinfo(np.uint16).max + 1
@@ -64,6 +65,8 @@ class LayoutOptions:
         compare_inputs: how it is found out whether the data set changed since an earlier run:
             "fast": by the names, sizes and times of its files; "content": all frames are made
             again and compared; "never": existing frames are kept.
+        boxes: .csv, .json or .parquet file of the boxes of one recording, as `label` and `map`
+            write it, in the frame of the first scan; instead of the boxes of the data set.
 
     Raises:
         ArgumentError: an unknown value of `axes`, `flow`, `images` or `compare_inputs`.
@@ -77,6 +80,7 @@ class LayoutOptions:
     level: bool = False
     allow_gaps: bool = False
     compare_inputs: CompareInputs = "fast"
+    boxes: AnyPath | None = None
 
     def __post_init__(self) -> None:
         check_types(LayoutOptions, vars(self))

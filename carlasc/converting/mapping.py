@@ -12,12 +12,17 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.converting.protocol import Failure, check_outside
-from carlasc.converting.registry import find_recordings, open_converter, readers_of
+from carlasc.converting.registry import (
+    find_recordings,
+    load_converter,
+    open_converter,
+    readers_of,
+)
 from carlasc.converting.run import convert, source_states
 from carlasc.core.frames import FrameRange, Frames
-from carlasc.errors import ArgumentError, CarlascError, MissingDataError, check_types
+from carlasc.errors import ArgumentError, CarlascError, MissingDataError, check_types, only
 from carlasc.groundtruth.maps.map_files import MapFiles
-from carlasc.groundtruth.maps.mapping import only, with_neighbours, write_grid, write_map
+from carlasc.groundtruth.maps.mapping import with_neighbours, write_grid, write_map
 from carlasc.inspection.findings import Finding
 from carlasc.motion.options import MotionOptions, PoseOptions
 from carlasc.running.spreading import Run, StepCounter
@@ -30,7 +35,6 @@ from carlasc.storage.protocol import Source
 from carlasc.storage.transport.trees import is_url
 
 _LEAST_CELL_M = 0.001  # smaller cells are finer than float32 positions
-_BAGS = (".bag", ".db3", ".mcap")
 _ANY_LIDAR = "scans"  # the converter of bare scans, which may also read folders of other data sets
 
 
@@ -193,7 +197,11 @@ def map(
             if recording.converter is None:
                 error.advice += f', with `converter="{reader}"`'
             raise
-        only(recordings, [one.location for one in recordings])
+        only(
+            "source",
+            {one.location: one for one in recordings},
+            "one recording, as a map has one frame",
+        )
         of_places = source_states(root, recordings, options)
         states = {name: state for of in of_places.values() for name, state in of.items()}
     first, settings = files.all[0], (cell_m, str(wanted), grid, [str(path) for path in files.all])
@@ -288,5 +296,6 @@ def _reader_of(source: AnyPath, grid: str | None) -> str | None:
     if names:
         return names[0]
     place = Path(source)  # what cannot be read says what it expects
-    inner = [place] if place.is_file() else place.iterdir()
-    return "bag" if any(path.suffix in _BAGS or path == place for path in inner) else _ANY_LIDAR
+    bags = load_converter("bag").endings
+    is_bag = place.is_file() or any(path.name.endswith(bags) for path in place.iterdir())
+    return "bag" if is_bag else _ANY_LIDAR

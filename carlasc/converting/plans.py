@@ -21,6 +21,7 @@ from carlasc.converting.assembling import (
     read_scan,
 )
 from carlasc.converting.chosen import ChosenFrames
+from carlasc.converting.given_boxes import GivenBoxes
 from carlasc.converting.plausibility import (
     POSE_S,
     Mount,
@@ -106,8 +107,8 @@ class RecordingPlan(Examined):
     Attributes:
         writer: the output.
         pose_source: where poses come from.
-        boxes: the annotated boxes by frame number, with class ids of the data set, right-handed, in
-            the frame of the scan; None if the data set has no boxes.
+        boxes: the annotated boxes by frame number, with class ids of the output, right-handed, in
+            the frame of the scan; None if there are none.
         flow: whether flow is written.
         voxels: geometry of the recording's own voxel grids, right-handed, if they are written.
         force: whether estimated poses are accepted without a check.
@@ -119,6 +120,7 @@ class RecordingPlan(Examined):
         again: whether all frames are made again and compared with those in the output, because the
             data set changed.
         is_same: whether it is the same data set nevertheless: some of its files are as they were.
+        given: the table of boxes that was given, which become `boxes` when poses are known.
     """
 
     writer: SequenceWriter
@@ -133,6 +135,7 @@ class RecordingPlan(Examined):
     unfinished: set[int] = field(default_factory=set)
     again: bool = False
     is_same: bool = False
+    given: GivenBoxes | None = None
 
     def make_again(self, *, is_same: bool) -> None:
         """Make all frames again, because the data set changed."""
@@ -146,6 +149,19 @@ class RecordingPlan(Examined):
         self.trajectory = at_frames(
             first_T_scan @ invert(self.recording.vehicle_T_scan), self.times
         )
+        self.place_boxes()
+
+    def place_boxes(self) -> None:
+        """Take the boxes of the given table, if there is one, under the poses, if these are known.
+
+        Raises:
+            FormatError: they are those of another drive.
+        """
+        if self.given is not None and self.poses is not None:
+            self.boxes, note = self.given.at_scans(
+                self.recording, self.times, self.poses, check=not self.force
+            )
+            self.notes += note
 
     @property
     def rig(self) -> Rig:
@@ -433,6 +449,8 @@ def plan_recording(
         MissingDataError: the recording has no poses or voxels, although they were requested.
         ConflictError: the output has another grid in the place of the voxels.
     """
+    target = output.of(converter)
+    given = None if output.boxes is None else GivenBoxes.read(output.boxes, target)
     writer = sink.sequence(sequence_path(recording))
     grew = is_provisional(writer)
     known = options.force or (writer.read_document(layout.POSES) is not None and not grew)
@@ -445,7 +463,7 @@ def plan_recording(
             advice=problem.advice,
         )
     recording = seen.recording
-    boxes = _read_boxes(recording)
+    boxes = _read_boxes(recording, target) if given is None else {}
     plan = RecordingPlan(
         **vars(seen),
         writer=writer,
@@ -453,10 +471,12 @@ def plan_recording(
         boxes=boxes,
         flow=output.flow == "auto"
         and (boxes is not None or (recording.has_labels and recording.has_instances)),
-        voxels=_check_voxels(recording, writer, output.of(converter)) if voxels else None,
+        voxels=_check_voxels(recording, writer, target) if voxels else None,
         force=options.force,
         voxel_m=options.odometry_voxel_m,
+        given=given,
     )
+    plan.place_boxes()
     numbers = {handle.number for handle in recording.frames}
     plan.missing = {number for number in numbers if not writer.has("points", number)}
     there = numbers - plan.missing
@@ -471,24 +491,26 @@ def _finished(plan: RecordingPlan, number: int) -> bool:
     return all(plan.writer.has(name, number) for name in plan.added)
 
 
-def _read_boxes(recording: Recording) -> dict[int, Boxes] | None:
-    """Return the boxes of the frames of a recording in the frame of the scan; None if the data set
-    has none.
+def _read_boxes(recording: Recording, target: AxesAndClasses) -> dict[int, Boxes] | None:
+    """Return the boxes of the frames of a recording, in the frame of the scan and the classes of
+    the output; None if the data set has none.
     """
     boxes = recording.boxes()
     if boxes is None:
         return None
-    last = recording.frames[-1].number
+    last, read = recording.frames[-1].number, dict[int, Boxes]()
     scan_T_vehicle = invert(recording.vehicle_T_scan)
     moved = not np.array_equal(scan_T_vehicle, np.eye(4))
-    moved_boxes = {}
     for number, own in boxes.items():
         if number <= last:  # also of frames without a scan, because they show the motion of objects
+            where = f"{recording.location}: frame {number}"
             try:
-                moved_boxes[number] = own.transform(scan_T_vehicle) if moved else own
+                placed = own.transform(scan_T_vehicle) if moved else own
             except FormatError as error:
-                raise error.within(f"{recording.location}: frame {number}") from error
-    return moved_boxes
+                raise error.within(where) from error
+            labels = target.map_labels(own.labels, f"boxes of {where}")
+            read[number] = replace(placed, labels=labels)
+    return read
 
 
 def _check_voxels(recording: Recording, writer: SequenceWriter, target: AxesAndClasses) -> GridSpec:

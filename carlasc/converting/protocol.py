@@ -318,11 +318,13 @@ class Converter(ABC):
     `sweeps: Annotated[bool, "Read all scans, not only key frames."] = True`. `carlasc convert NAME
     --help` shows them.
 
-    All attributes except `title` may be set in the constructor, if they depend on options.
+    All attributes except `title` and `endings` may be set in the constructor, if they depend on
+    options.
 
     Attributes:
         source: folder of the data set, or of one of its sequences.
         title: what it reads, in a few words.
+        endings: of the names of files that are a recording; empty if recordings are folders.
         classes: the data set's class table.
         to_carla: maps its ids to CarlaSC's; None if no map exists, or if they are CarlaSC's
             already. Sequences then keep their ids.
@@ -338,6 +340,7 @@ class Converter(ABC):
     """
 
     title: ClassVar[str]
+    endings: ClassVar[tuple[str, ...]] = ()
     classes: ClassTable
     to_carla: Remap | None
     keeps_classes: bool = False

@@ -33,11 +33,12 @@ from carlasc.converting.stages import Conversion
 from carlasc.core.choices import CompareInputs
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError, MissingDataError, check_choice, check_types
+from carlasc.errors import ArgumentError, MissingDataError, check_choice, check_types, only
 from carlasc.groundtruth.inputs import remove_provisional
 from carlasc.groundtruth.options import FromScans, GridOptions, Voting, fit_to_ground, fit_to_reach
 from carlasc.groundtruth.run import regrid
 from carlasc.inspection.findings import Finding
+from carlasc.motion.box_table import ONE_FRAME
 from carlasc.motion.ground import Ground, joined
 from carlasc.motion.options import PoseOptions
 from carlasc.running.processes import one_pool
@@ -158,6 +159,8 @@ def convert(
             "recordings",
             found="True",
         )
+    if run.sequences_from is not None and layout.boxes is not None:
+        raise ArgumentError("boxes", expected="one recording", found="a list of clips")
     if run.sequences_from is not None and not isinstance(out, Sink):
         places = {"source", "out", "run", "scratch"}
         given = {key: arguments[key] for key in sorted(arguments.keys() - places)}
@@ -170,7 +173,10 @@ def convert(
     check_arguments(root, sink, split, grids)
     compare = layout.compare_inputs
     found = find_recordings(converter)
-    recordings = _deal(choose_recordings(found, root, sequences, split), run.part)
+    every = choose_recordings(found, root, sequences, split)
+    if layout.boxes is not None:
+        only("boxes", {one.name: one for one in every}, ONE_FRAME)
+    recordings = _deal(every, run.part)
     if isinstance(grids, GridOptions):
         _check_rays(recordings)
     has_voxels, chosen = isinstance(grids, str), FrameRange.of(frames)
@@ -183,7 +189,8 @@ def convert(
     if isinstance(grids, GridOptions) and isinstance(grids.observe, FromScans):
         for plan in plans:
             plan.max_range_m = grids.observe.max_range_m
-    states = None if compare == "never" else source_states(root, found, options)
+    read = {**(options or {}), "boxes": layout.boxes}
+    states = None if compare == "never" else source_states(root, found, read)
     records = []
     for plan in plans:
         own = None if states is None else states[None] | states.get(plan.recording.location, {})
@@ -191,9 +198,9 @@ def convert(
         records[-1].begin(compare)
     metadata = describe(converter, name, layout)
 
-    every = sum(len(plan.recording.frames) for plan in plans)
-    in_grids = every if isinstance(grids, GridOptions) else 0
-    steps = StepCounter(run.progress, every + in_grids)
+    scans = sum(len(plan.recording.frames) for plan in plans)
+    in_grids = scans if isinstance(grids, GridOptions) else 0
+    steps = StepCounter(run.progress, scans + in_grids)
     with one_pool(run) as pooled:
         conversions = [
             Conversion(plan, converter, target, layout.images, pooled, steps, layout.allow_gaps)
@@ -213,11 +220,11 @@ def convert(
             # without the motion that some frames wait for, grids would be made in another way
             converted = [one for one in conversions if one.has_scans and not one.waits]
             if converted:  # otherwise every frame failed, and is reported
-                scans = _ConvertedScans(sink, converted)
-                spec, observe, cut = plan_grids(grids, converted, scans, poses)
+                written = _ConvertedScans(sink, converted)
+                spec, observe, cut = plan_grids(grids, converted, written, poses)
                 voting = grids.voting or Voting()
                 made = regrid(
-                    scans,
+                    written,
                     spec,
                     out,
                     observe=observe,
@@ -226,7 +233,7 @@ def convert(
                     run=alone,
                 )
                 made = replace(made, notes=(*cut, *made.notes))
-                for sequence in scans.values():
+                for sequence in written.values():
                     remove_provisional(sink.sequence(sequence.path), sequence)
 
     failures = [failure for conversion in conversions for failure in conversion.failures]

@@ -569,23 +569,14 @@ class Conversion:
         ]
 
     def _box_tracks(self) -> tuple[list[Track] | None, dict[int, Boxes]]:
-        """Return the tracks of the recording's boxes, and the boxes of each annotated frame, in the
-        classes of the target.
-        """
+        """Return the tracks of the recording's boxes, and the boxes of each annotated frame."""
         plan = self.plan
         if plan.boxes is None or plan.poses is None:
             return None, {}
-        where = f"boxes of {plan.recording.location}"
-        boxes = {
-            number: replace(
-                own, labels=self.target.map_labels(own.labels, f"{where}: frame {number}")
-            )
-            for number, own in plan.boxes.items()
-        }
-        poses = {number: plan.poses[number] for number in boxes}
+        poses = {number: plan.poses[number] for number in plan.boxes}
         numbers = sorted(poses.keys() | {handle.number for handle in plan.recording.frames})
         times = {number: float(plan.times[number]) for number in numbers}
-        return tracks_from_boxes(boxes, poses, times), boxes
+        return tracks_from_boxes(plan.boxes, poses, times), plan.boxes
 
     def find_ground(self) -> None:
         """Find the ground in some of the scans; write the height of the sensor if the data set

@@ -34,11 +34,13 @@ from carlasc.errors import (
     StorageError,
     check_choice,
     check_types,
+    only,
     reading,
 )
 from carlasc.groundtruth.from_capture import capture_sequences
 from carlasc.groundtruth.from_grid import resampled_sequences
-from carlasc.groundtruth.from_scans.sequences import scan_sequences
+from carlasc.groundtruth.from_scans.actor_voxels import with_numbers
+from carlasc.groundtruth.from_scans.sequences import ScanSequence, scan_sequences
 from carlasc.groundtruth.inputs import (
     FrameData,
     FrameInput,
@@ -50,6 +52,7 @@ from carlasc.groundtruth.inputs import (
 from carlasc.groundtruth.options import FromCapture, FromScans, Observe, Voting
 from carlasc.groundtruth.reporting import Changes, FrameFacts, Report, sample_frames
 from carlasc.groundtruth.seen import check_views, see_voxels
+from carlasc.motion.box_table import ONE_FRAME, check_box_file
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run, StepCounter, check_shared
 from carlasc.storage import as_source, layout
@@ -112,6 +115,7 @@ def regrid(
     name: str | None = None,
     overwrite: bool = False,
     compare_inputs: CompareInputs = "fast",
+    boxes_out: AnyPath | None = None,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> RegridResult:
     """Make the ground-truth grid of every frame, and write it with its scans, flow, poses and
@@ -142,6 +146,8 @@ def regrid(
         compare_inputs: how it is found out whether the inputs of existing frames changed: "fast":
             by the size and the time of each file, and by content where these differ; "content":
             by content; "never": existing frames are kept.
+        boxes_out: .csv, .json or .parquet file of the boxes of the moving actors of one sequence,
+            which is replaced: one row per actor and scan, as `label_motion` writes it.
         run: how the work is spread, whether this is only a part of it, and what shows its progress.
             The last part to finish writes the report, and finishes a packed store.
 
@@ -178,6 +184,10 @@ def regrid(
     except MissingDataError:
         if not others:
             raise
+    merged = [one for one in found if isinstance(one, ScanSequence) and one.feed.needs_actors]
+    if boxes_out is not None:
+        only("boxes_out", {one.path: one for one in merged}, f"{ONE_FRAME}, with scans that move")
+        check_box_file("boxes_out", Path(boxes_out))
     jobs = [_prepare(one, sink, plan, compare_inputs, overwrite=overwrite) for one in found]
 
     with ExitStack() as open_things:
@@ -188,6 +198,13 @@ def regrid(
             open_things.enter_context(job.writer)
         work = Work(jobs, plan, pool)
         failures = work.run()
+        if boxes_out is not None:
+            (one,) = merged
+            one.prepare(
+                jobs[found.index(one)].writer, pool, lambda steps: None
+            )  # unless a grid needed it
+            one.actors = with_numbers(one.actors, one.feed)
+            one.box_table(one.feed.frames.tolist()).write(boxes_out)
     # the caller may write more into its own sink
     if sink is not out and (work.has_written or not sink.is_finished):
         if run.part.count == 1:

@@ -11,7 +11,7 @@ import numpy as np
 from carlasc.core.arrays import BoolArray, FloatArray
 from carlasc.core.boxes import mirror_boxes
 from carlasc.core.geometry import invert, mirror_poses, transform_points
-from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_types, import_extra
+from carlasc.errors import MissingDataError, check_types, import_extra, only
 from carlasc.metrics.confusion import json_number
 from carlasc.metrics.results import Cell, FigureTable
 from carlasc.motion import BoxTable, tracks_from_boxes
@@ -20,8 +20,6 @@ from carlasc.storage.files import AnyPath
 
 _THRESHOLDS = (0.3, 0.5, 0.7)  # of IoU
 _LEVELS = np.arange(1, 41) / 40  # recall values of KITTI's average precision
-_APART_S = 0.05  # boxes that are farther from the time of a frame are not of it
-_FARTHEST_M = 500.0  # boxes farther from the sensor are of another drive
 _KEPT = 1000.0  # a pair of the frame before is kept, as in TrackEval, if its IoU still suffices
 
 
@@ -60,7 +58,8 @@ class BoxScores:
     Attributes:
         name: name of the found boxes.
         frames: number of annotated frames.
-        left_out: number of found boxes at times without an annotated frame.
+        left_out: number of found boxes at times without an annotated frame, or with a nearer box of
+            the same object.
         scores: the scores, by objects and IoU.
     """
 
@@ -135,17 +134,11 @@ def evaluate_boxes(
     table = found if isinstance(found, BoxTable) else BoxTable.read(found)
     where = "found" if isinstance(found, BoxTable) else str(found)
     source = as_source(truth)
-    having = [one for one in source.sequences().values() if len(one.frames("boxes"))]
+    having = {path: one for path, one in source.sequences().items() if len(one.frames("boxes"))}
     if not having:
         raise MissingDataError(source, expected="annotated boxes, in the field boxes", found="none")
-    if len(having) > 1:
-        raise ArgumentError(
-            "truth",
-            expected="one sequence with boxes",
-            found=f"{len(having)}",
-            advice="give the folder of one",
-        )
-    sequence, numbers = having[0], having[0].frames("boxes")
+    sequence = only("truth", having, "one sequence with boxes")
+    numbers = sequence.frames("boxes")
     times, frames = sequence.times_of(numbers), numbers.tolist()
     poses = np.stack([sequence.read_pose(frame) for frame in frames])
     boxes = {f: given for f in frames if (given := sequence.boxes(f)) is not None}
@@ -154,21 +147,12 @@ def evaluate_boxes(
     pose_of = dict(zip(frames, poses, strict=True))
     tracks = tracks_from_boxes(boxes, pose_of, dict(zip(frames, times.tolist(), strict=True)))
 
-    place = np.searchsorted((times[1:] + times[:-1]) / 2, table.times)
-    place[np.abs(times[place] - table.times) > _APART_S] = -1
-    if (place < 0).all():
-        raise FormatError(
-            where,
-            expected=f"times of {sequence.location}, {times[0]:g} to {times[-1]:g} s",
-            found=f"{table.times.min():g} to {table.times.max():g} s",
-            advice="give the boxes of this sequence, in seconds since its first frame",
-        )
-    gathered, nearest = [], math.inf
+    place = table.frames_of(times, poses, where, sequence.location)
+    gathered = []
     for index, frame in enumerate(frames):
         own, world = np.flatnonzero(place == index), boxes[frame].transform(poses[index])
         values, axes = table.values[own], world.sensor_T_box[:, :2, 0]
         local = transform_points(invert(poses[index]), values[:, :3])
-        nearest = min(nearest, float(np.linalg.norm(local, axis=1).min(initial=math.inf)))
         inside = [
             (np.hypot(at[:, 0], at[:, 1]) >= near_m)
             & (np.hypot(at[:, 0], at[:, 1]) < far_m)
@@ -192,13 +176,6 @@ def evaluate_boxes(
                 np.abs(turned),
                 np.linalg.norm(velocity[:, None, :2] - values[:, 7:9], axis=2),
             )
-        )
-    if nearest > _FARTHEST_M:
-        raise FormatError(
-            where,
-            expected=f"boxes within {_FARTHEST_M:g} m of the sensor of {sequence.location}",
-            found=f"none: the nearest is {nearest:.0f} m away",
-            advice="give the boxes of this sequence, in the frame of its poses",
         )
     scores = [
         _score(gathered, objects, threshold)

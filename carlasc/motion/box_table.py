@@ -13,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 
 from carlasc.core.arrays import FloatArray, IntArray
-from carlasc.core.geometry import transform_points
+from carlasc.core.geometry import Transform, rotate_vectors, transform_points
 from carlasc.errors import (
     ArgumentError,
     FormatError,
@@ -21,16 +21,21 @@ from carlasc.errors import (
     check_types,
     import_extra,
     reading,
+    within,
 )
 from carlasc.motion.tracks import Track
 from carlasc.storage.files import AnyPath, to_json, write_output
 
+ONE_FRAME = "one sequence, as a table of boxes has one frame"
+"""What is expected of the source, or of the output, of a table."""
 BOX_ENDINGS = (".csv", ".json", ".parquet")
 """Endings of the files of a `BoxTable`."""
 
 _NUMBERS = "x y z length width height heading vx vy vz confidence".split()
 _COLUMNS = ("time", "number", "class", *_NUMBERS)
 _DEFAULTS = {"vx": np.nan, "vy": np.nan, "vz": np.nan, "confidence": 1.0}  # of absent columns
+_APART_S = 0.05  # boxes that are farther from the time of a frame are not of it
+_FARTHEST_M = 500.0  # boxes farther from the sensor are of another drive
 
 
 @dataclass(frozen=True)
@@ -78,41 +83,47 @@ class BoxTable:
     def of_tracks(
         cls,
         tracks: Mapping[int, Track],
-        frames: Mapping[int, float],
+        frames: Mapping[int, tuple[float, Transform]],
         names: Mapping[int, str],
         *,
         left: bool,
-        numbers: Mapping[int, int] | None = None,
+        numbers: Mapping[int, int] = {},
     ) -> Self:
         """Return the boxes of tracks, in order of the tracks, then of time.
 
         Args:
             tracks: the tracks by number.
-            frames: seconds by frame.
+            frames: seconds, and (4, 4) table_T_world, by frame.
             names: names of the classes.
             left: whether the axes of the tracks are left-handed.
-            numbers: other numbers of the tracks, by number. Of two boxes of one number in a frame,
-                the one with points is kept.
+            numbers: other numbers of the tracks, by number; empty for the same. Of two boxes of one
+                number in a frame, the one with points is kept.
         """
         signs = (1, -1, 1) if left else (1, 1, 1)
-        rows = dict[tuple[int, int], tuple[float, str, FloatArray]]()
+        rows = dict[tuple[int, int], tuple[Any, ...]]()
         for number, track in tracks.items():
-            for frame, seconds in frames.items():
+            for frame, (seconds, table_T_world) in frames.items():
                 pose, velocity = track.pose(frame), track.velocity_at(frame)
                 key = (numbers[number] if numbers else number, frame)
                 if pose is None or velocity is None or (key in rows and frame not in track.members):
                     continue
+                pose, velocity = table_T_world @ pose, rotate_vectors(table_T_world, velocity)
                 middle = transform_points(pose, (track.lower + track.upper) / 2) * signs
-                ahead, moves = pose[:3, 0] * signs, velocity * signs
-                last = (track.confidence,)
-                own = (middle, track.size, [np.arctan2(ahead[1], ahead[0])], moves, last)
-                rows[key] = (round(seconds, 6), names[track.label], np.concatenate(own).round(4))
-        return cls(
-            np.array([row[0] for row in rows.values()], np.float64),
-            np.array([key[0] for key in rows], np.int64),
-            tuple(row[1] for row in rows.values()),
-            np.array([row[2] for row in rows.values()]).reshape(-1, len(_NUMBERS)),
+                ahead, last = pose[:3, 0] * signs, (track.confidence,)
+                heading = [np.arctan2(ahead[1], ahead[0])]
+                own = np.concatenate([middle, track.size, heading, velocity * signs, last])
+                rows[key] = (round(seconds, 6), key[0], names[track.label], *own.round(4))
+        return cls._of([*rows.values()])
+
+    @classmethod
+    def _of(cls, rows: list[tuple[Any, ...]]) -> Self:
+        """Return the table of rows with a value per column, numbers or text."""
+        times, numbers, classes = (
+            zip(*(row[:3] for row in rows), strict=True) if rows else ((),) * 3
         )
+        values = np.array([row[3:] for row in rows], np.float64).reshape(-1, len(_NUMBERS))
+        whole = np.array([int(float(number)) for number in numbers], np.int64)
+        return cls(np.array(times, np.float64), whole, tuple(map(str, classes)), values)
 
     @classmethod
     def read(cls, path: AnyPath) -> Self:
@@ -141,17 +152,42 @@ class BoxTable:
                 found=found,
                 advice="write it with `carlasc label --from motion --boxes-out` or `carlasc map`",
             )
-        with reading(path, "numbers in all columns but class"):
-            numbers = np.array([int(float(row["number"])) for row in rows], np.int64)
-            times = np.array([float(row["time"]) for row in rows])
-            values = [
-                [float(row.get(name, _DEFAULTS.get(name, np.nan))) for name in _NUMBERS]
-                for row in rows
-            ]
-        try:
-            return cls(times, numbers, tuple(str(row["class"]) for row in rows), np.array(values))
-        except FormatError as error:
-            raise error.within(path) from error
+        with reading(path, "numbers in all columns but class"), within(path):
+            return cls._of([tuple({**_DEFAULTS, **row}[name] for name in _COLUMNS) for row in rows])
+
+    def frames_of(self, times: FloatArray, poses: FloatArray, where: str, drive: str) -> IntArray:
+        """Return (R,) the index of the frame of each box: the nearest in time, -1 without one
+        within 0.05 s. Of several boxes of an object, only the nearest in time is of a frame.
+
+        Args:
+            times: (F,) seconds of the frames, increasing.
+            poses: (F, 4, 4) world_T_sensor, in the frame of the table.
+            where: the file of the table, for errors.
+            drive: the sequence, for errors.
+
+        Raises:
+            FormatError: no box is at the time of a frame, or none is within 500 m of the sensor.
+        """
+        index = np.searchsorted((times[1:] + times[:-1]) / 2, self.times)
+        apart = np.abs(times[index] - self.times)
+        late = np.argsort(-apart, kind="stable").tolist()  # the nearest last, which is kept
+        kept = np.array([*{(index[row], self.numbers[row]): row for row in late}.values()])
+        kept = kept[apart[kept] < _APART_S]
+        away = np.linalg.norm(self.values[kept, :3] - poses[index[kept], :3, 3], axis=1)
+        nearest = away.min(initial=np.inf)
+        if nearest > _FARTHEST_M:
+            far = f", the nearest {nearest:.0f} m away" if len(kept) else ""
+            raise FormatError(
+                where,
+                expected=f"boxes at {times[0]:g} to {times[-1]:g} s, within {_FARTHEST_M:g} m of "
+                f"the sensor of {drive}",
+                found=f"boxes at {self.times.min():g} to {self.times.max():g} s{far}",
+                advice="give the boxes of this sequence, in the frame of its poses, and seconds "
+                "since its first frame",
+            )
+        frames = np.full(len(index), -1)
+        frames[kept] = index[kept]
+        return frames
 
     def write(self, path: AnyPath) -> None:
         """Write the table; an existing file is replaced.

@@ -13,13 +13,13 @@ from carlasc.core.arrays import AnyArray, BoolArray, Float32Array, FloatArray, U
 from carlasc.core.frames import FrameRange
 from carlasc.core.geometry import invert, moved_back, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError, check_types
+from carlasc.errors import ArgumentError, check_types, only
 from carlasc.groundtruth.from_scans.actor_voxels import velocity_at
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
 from carlasc.groundtruth.inputs import GridPlan
 from carlasc.groundtruth.options import FromScans, Voting
-from carlasc.motion.box_table import BoxTable, check_box_file
+from carlasc.motion.box_table import ONE_FRAME, check_box_file
 from carlasc.motion.ground import ground_points
 from carlasc.motion.tracks import MovingActors, Track
 from carlasc.relabelling.copies import timed, write_in_stages
@@ -104,14 +104,8 @@ def label_motion(
     share = Share(as_source(source), run)
     given = sequences_with_scans(share)
     if boxes_out is not None:
+        only("boxes_out", given, ONE_FRAME)
         check_box_file("boxes_out", Path(boxes_out))
-        if len(given) != 1:
-            raise ArgumentError(
-                "boxes_out",
-                expected="one sequence, as a table has one frame",
-                found=f"{len(given)} sequences",
-                advice="give the folder of one",
-            )
     inputs = scan_sequences_of(given, observe)
     copy = DerivedCopy(
         share,
@@ -128,7 +122,7 @@ def label_motion(
     ) -> _MovingSequence:
         inputs[path].prepare(writer, pool, step)
         if boxes_out is not None:
-            _boxes_of(inputs[path]).write(boxes_out)
+            inputs[path].box_table(given[path].frames("points").tolist()).write(boxes_out)
         return _MovingSequence(given[path], inputs[path].feed, inputs[path].actors)
 
     scans = sum(one.steps_before for one in inputs.values())
@@ -145,18 +139,6 @@ def label_motion(
         **timed(copied, began),
         actors=sum(len(set(one.actors.numbers.values())) for one in moving.values()),
         notes=notes,
-    )
-
-
-def _boxes_of(inputs: ScanSequence) -> BoxTable:
-    """Return the boxes of the moving actors, with their numbers over the whole sequence."""
-    frames, metadata = inputs.sequence.frames("points").tolist(), inputs.metadata
-    return BoxTable.of_tracks(
-        inputs.actors.tracks,
-        dict(zip(frames, inputs.feed.sequence.times_of(frames).tolist(), strict=True)),
-        metadata.classes.names,
-        left=metadata.axes == "left",
-        numbers=inputs.actors.numbers,
     )
 
 

@@ -17,6 +17,7 @@ from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, FormatError, MissingDataError, first_names
 from carlasc_converters.bag_messages import CAMERA_INFO, PATH, TRANSFORMS, read_placed
 from carlasc_converters.bag_topics import (
+    ENDINGS,
     BagCamera,
     BagFiles,
     BagFrame,
@@ -40,6 +41,7 @@ class Bag(Converter):
     """Reads bags of ROS 1 (.bag), ROS 2 (.db3, .mcap) and Foxglove (.mcap), without ROS."""
 
     title: ClassVar[str] = "a bag of ROS 1, ROS 2 or Foxglove"
+    endings = ENDINGS
     classes = CARLA
     to_carla = None
 

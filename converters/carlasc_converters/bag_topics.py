@@ -58,7 +58,7 @@ from carlasc_converters.point_fields import (
 )
 
 _KINDS = (ros1_bag, mcap_file, db3_file)
-_ENDINGS = (".bag", ".bag.active", ".mcap", ".db3")
+ENDINGS = (".bag", ".bag.active", ".mcap", ".db3")
 _PACKED = (".db3.zstd", ".mcap.zstd")
 _LEVELS = 3  # how deep below the given folder a bag may be
 _ZSTD = (
@@ -258,10 +258,10 @@ def find_bags(source: Path) -> list[list[Path]]:
     if source.is_file():
         return [[source]]
     patterns = (
-        "*/" * level + f"*{ending}" for level in range(_LEVELS) for ending in (*_ENDINGS, *_PACKED)
+        "*/" * level + f"*{ending}" for level in range(_LEVELS) for ending in (*ENDINGS, *_PACKED)
     )
     files = sorted(path for pattern in patterns for path in source.glob(pattern) if path.is_file())
-    bags = [path for path in files if path.name.endswith(_ENDINGS)]
+    bags = [path for path in files if path.name.endswith(ENDINGS)]
     if not bags:
         packed = next((path.name for path in files if path.name.endswith(_PACKED)), None)
         raise MissingDataError(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from carlasc.core.arrays import FloatArray, IntArray
-from carlasc.core.geometry import check_rigid, transform_points
+from carlasc.core.geometry import check_rigid, invert, transform_points
 from carlasc.core.grids import Grid
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
 from carlasc.groundtruth.from_scans.actor_voxels import with_numbers
@@ -40,6 +40,7 @@ from carlasc.groundtruth.inputs import (
 from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.reporting import PoseFacts, Residual
 from carlasc.motion import ground_points
+from carlasc.motion.box_table import BoxTable
 from carlasc.motion.odometry import estimate_poses
 from carlasc.motion.refinement import MIN_SCANS, RefinedPoses
 from carlasc.motion.tracks import FIRST_FOUND, MovingActors, is_doubtful, is_possible
@@ -283,6 +284,20 @@ class ScanSequence(StoredSequence):
             self.feed = self.feed.with_poses_of(
                 with_refined_poses(self.posed, self.feed.frames, refined)
             )
+
+    def box_table(self, frames: list[int], *, refined: bool = False) -> BoxTable:
+        """Return the boxes of the moving actors, which were found, at some frames: in the frame of
+        the sequence's own poses, or of the refined ones.
+        """
+        times = dict(zip(frames, self.posed.times_of(frames).tolist(), strict=True))
+        feed = self.feed if refined else ScanFeed(self.posed, self.options)
+        return BoxTable.of_tracks(
+            self.actors.tracks,
+            {f: (times[f], feed.pose(f) @ invert(self.feed.pose(f))) for f in frames},
+            self.metadata.classes.names,
+            left=self.metadata.axes == "left",
+            numbers=self.actors.numbers,
+        )
 
     def summaries(self) -> Series[Mapping[str, Any]] | None:
         """Return the facts of each actor, by number; None if actors are not tracked."""

@@ -7,7 +7,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from carlasc.core.arrays import AnyArray, FloatArray, IntArray
 from carlasc.core.frames import FrameRange
 from carlasc.core.geometry import invert, mirror_poses, quaternions_of, transform_points
 from carlasc.core.grids import GridSpec, mirror_voxels
-from carlasc.errors import ArgumentError, MissingDataError, count
+from carlasc.errors import ArgumentError, MissingDataError, count, only
 from carlasc.groundtruth.from_scans.feed import ScanFeed, WithoutScans
 from carlasc.groundtruth.from_scans.merging import Merger
 from carlasc.groundtruth.from_scans.sequences import ScanSequence, scan_sequences
@@ -32,7 +32,6 @@ from carlasc.groundtruth.maps.growing_cells import (
 from carlasc.groundtruth.maps.map_files import ACTORS, MapCells, MapFiles, write_distances
 from carlasc.groundtruth.options import FromScans, Voting
 from carlasc.motion import HORIZON_S, Track
-from carlasc.motion.box_table import BoxTable
 from carlasc.motion.evidence import views_of
 from carlasc.motion.options import MotionOptions, PoseOptions
 from carlasc.motion.parked import (
@@ -91,7 +90,7 @@ def write_map(
         if files.trajectory is not None:
             drive.write_trajectory(files.trajectory)
         if files.boxes is not None:
-            drive.write_boxes(files.boxes)
+            drive.inputs.box_table(drive.frames, refined=True).write(files.boxes)
         if files.actors is not None and files.out is not None:
             bodies = drive.write_actors(files.actors, files.out.suffix.lower())
     return MapContent(points, len(drive.frames), bodies, drive.parked, drive.notes())
@@ -127,7 +126,11 @@ class DriveMap:
         plan = GridPlan(GridSpec.published(), "map", options, Voting(), frames)
         found = scan_sequences(source, plan, options)
         having = [one.sequence for one in found if isinstance(one, ScanSequence)]
-        sequence = only(having, [one.path or one.location for one in having])
+        sequence = only(
+            "source",
+            {one.path or one.location: one for one in having},
+            "one sequence, as a map has one frame",
+        )
         known = sequence.frames("points")
         chosen = choose_frames(frames, known, sequence.location)
         near = with_neighbours(FrameRange(chosen[0], chosen[-1] + 1))
@@ -211,17 +214,6 @@ class DriveMap:
         table = np.column_stack([sequence.times_of(self.frames), poses[:, :3, 3], turns])
         lines = (" ".join(f"{value:.9g}" for value in row) for row in table.tolist())
         write_atomic(path, "".join(f"{line}\n" for line in lines).encode())
-
-    def write_boxes(self, path: Path) -> None:
-        """Write the box of each moving actor at each scan, in order of actors, then of time."""
-        metadata = self.inputs.metadata
-        times = self.inputs.feed.sequence.times_of(self.frames).tolist()
-        BoxTable.of_tracks(
-            self.inputs.actors.tracks,
-            dict(zip(self.frames, times, strict=True)),
-            metadata.classes.names,
-            left=metadata.axes == "left",
-        ).write(path)
 
     def write_actors(self, folder: Path, ending: str) -> int:
         """Write the body of each actor, in its own frame, and its poses; return the number of
@@ -352,7 +344,11 @@ def write_grid(source: Source, name: str, frames: FrameRange, files: MapFiles) -
         raise MissingDataError(
             source.location, expected=f"the grid {name}", found=", ".join(names) or "no grid"
         )
-    sequence = only(having, [one.path or one.location for one in having])
+    sequence = only(
+        "source",
+        {one.path or one.location: one for one in having},
+        "one sequence, as a map has one frame",
+    )
     where = f"{sequence.location}/{name}"
     chosen = choose_frames(frames, sequence.frames(f"{name}/labels"), where)
     if len(chosen) > 1:
@@ -392,23 +388,3 @@ def with_neighbours(frames: FrameRange) -> FrameRange:
     return FrameRange(
         None if start is None else max(start - around, 0), None if stop is None else stop + around
     )
-
-
-T = TypeVar("T")
-
-
-def only(found: list[T], names: list[str]) -> T:
-    """Return the one sequence, or recording.
-
-    Raises:
-        ArgumentError: there are several.
-    """
-    if len(found) != 1:
-        few = ", ".join(names[:3])
-        raise ArgumentError(
-            "source",
-            expected="one sequence, as a map has one frame",
-            found=f"{len(found)} ({few}{', ...' if len(found) > 3 else ''})",
-            advice="give the folder of one",
-        )
-    return found[0]
