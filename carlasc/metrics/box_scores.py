@@ -171,7 +171,7 @@ def evaluate_boxes(
                 world.annotated & inside[0],
                 np.isin(world.tracks, [track.instance for track in tracks if track.moves]),
                 ~inside[1],
-                values[:, -1],
+                values[:, 10],
                 _overlaps(true, values[:, [0, 1, 3, 4, 6]]),
                 np.abs(turned),
                 np.linalg.norm(velocity[:, None, :2] - values[:, 7:9], axis=2),

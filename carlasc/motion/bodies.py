@@ -47,6 +47,14 @@ _INSET_M = (
 # Of a car, as fractions: the height of its body, the ends and the width of its cabin.
 _BELT, _CABIN, _CABIN_WIDE = 0.62, (0.08, 0.75), 0.85
 
+# True sizes of vehicles less those that are found, metres, of which one face, two or more are seen:
+# 5% and 95% quantiles of length, width and height (docs/studies/bodies.py, other drives).
+_ERRORS_M = {
+    1: ((-0.65, -0.05, 0.06), (3.56, 0.99, 1.48)),
+    2: ((-0.06, -0.07, 0.05), (1.58, 0.16, 0.63)),
+    3: ((-0.08, -0.01, 0.08), (0.22, 0.07, 0.48)),
+}
+
 LENGTH, WIDTH = 0, 1
 # Length and width, metres, of vehicles with two wheels, cars, vans, and lorries and buses.
 _TWO_WHEELS, _CAR, _VAN, _LORRY = (1.8, 0.7), (4.4, 1.85), (5.4, 2.0), (7.5, 2.5)
@@ -100,6 +108,18 @@ class Extent:
             for axis, shares in enumerate(_SHORTEST)
         )
         return length, width
+
+    def interval(self, size: FloatArray) -> FloatArray:
+        """Return (2, 3) metres, between which the true length, width and height of 90 in 100
+        vehicles are; NaN without points or a visible face, and for actors with two wheels.
+
+        Args:
+            size: (3,) length, width and height that were found.
+        """
+        faces = min(sum(self.faces), max(_ERRORS_M))
+        if not faces or not self.points or size[WIDTH] < _ACTORS_WIDE_M:
+            return np.full((2, 3), np.nan)
+        return size + np.array(_ERRORS_M[faces])
 
     @property
     def exemplary(self) -> bool:

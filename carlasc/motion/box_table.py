@@ -7,6 +7,7 @@ import io
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import isnan
 from pathlib import Path
 from typing import Any, Self
 
@@ -23,6 +24,7 @@ from carlasc.errors import (
     reading,
     within,
 )
+from carlasc.motion.bodies import BODY_MARGIN_M
 from carlasc.motion.tracks import Track
 from carlasc.storage.files import AnyPath, to_json, write_output
 
@@ -31,9 +33,11 @@ ONE_FRAME = "one sequence, as a table of boxes has one frame"
 BOX_ENDINGS = (".csv", ".json", ".parquet")
 """Endings of the files of a `BoxTable`."""
 
-_NUMBERS = "x y z length width height heading vx vy vz confidence".split()
+_INTERVAL = [f"{size}_{end}" for end in ("min", "max") for size in ("length", "width", "height")]
+_NUMBERS = [*"x y z length width height heading vx vy vz confidence".split(), *_INTERVAL]
 _COLUMNS = ("time", "number", "class", *_NUMBERS)
-_DEFAULTS = {"vx": np.nan, "vy": np.nan, "vz": np.nan, "confidence": 1.0}  # of absent columns
+_OPTIONAL = ("vx", "vy", "vz", *_INTERVAL)  # NaN where not known
+_DEFAULTS = {**dict.fromkeys(_OPTIONAL, np.nan), "confidence": 1.0}  # of absent columns
 _APART_S = 0.05  # boxes that are farther from the time of a frame are not of it
 _FARTHEST_M = 500.0  # boxes farther from the sensor are of another drive
 
@@ -47,8 +51,9 @@ class BoxTable:
         times: (R,) float64 seconds since the first frame.
         numbers: (R,) int64 number of the object of each box.
         classes: (R,) names of the classes.
-        values: (R, 11) float64: middle x, y, z, length, width and height, metres; heading, radians,
-            anticlockwise from x; velocity x, y and z, m/s, NaN where not known; confidence, 0 to 1.
+        values: (R, 17) float64: middle x, y, z, length, width and height, metres; heading, radians,
+            anticlockwise from x; velocity x, y and z, m/s; confidence, 0 to 1; least, then greatest
+            length, width and height, metres. Velocities and intervals are NaN where not known.
 
     Raises:
         FormatError: a number is not finite, a size is not positive, or an object has two boxes at
@@ -62,13 +67,13 @@ class BoxTable:
 
     def __post_init__(self) -> None:
         check_types(BoxTable, vars(self))
-        known = np.delete(self.values, [7, 8, 9], axis=1)
+        known = self.values[:, [column not in _OPTIONAL for column in _NUMBERS]]
         whole = np.isfinite(np.column_stack([self.times, known])).all(axis=1)
         first = np.zeros(len(self.times), np.bool_)
         keys = np.column_stack([self.times, self.numbers])
         first[np.unique(keys, axis=0, return_index=True)[1]] = True
         for valid, expected in (
-            (whole, "finite numbers in all columns but those of the velocity"),
+            (whole, "finite numbers, but of velocities and intervals"),
             ((self.values[:, 3:6] > 0).all(axis=1), "a length, width and height above 0 metres"),
             (first, "one box per time and number"),
         ):
@@ -111,7 +116,8 @@ class BoxTable:
                 middle = transform_points(pose, (track.lower + track.upper) / 2) * signs
                 ahead, last = pose[:3, 0] * signs, (track.confidence,)
                 heading = [np.arctan2(ahead[1], ahead[0])]
-                own = np.concatenate([middle, track.size, heading, velocity * signs, last])
+                body = track.extent.interval(track.size - 2 * BODY_MARGIN_M).ravel()
+                own = np.concatenate([middle, track.size, heading, velocity * signs, last, body])
                 rows[key] = (round(seconds, 6), key[0], names[track.label], *own.round(4))
         return cls._of([*rows.values()])
 
@@ -127,8 +133,8 @@ class BoxTable:
 
     @classmethod
     def read(cls, path: AnyPath) -> Self:
-        """Read a file that `write` has written, or another one with its columns; those of velocity
-        and confidence may be absent.
+        """Read a file that `write` has written, or another one with its columns; those of velocity,
+        confidence and intervals may be absent.
 
         Raises:
             ArgumentError: the ending is not known.
@@ -153,7 +159,9 @@ class BoxTable:
                 advice="write it with `carlasc label --from motion --boxes-out` or `carlasc map`",
             )
         with reading(path, "numbers in all columns but class"), within(path):
-            return cls._of([tuple({**_DEFAULTS, **row}[name] for name in _COLUMNS) for row in rows])
+            # what is empty in a file is absent
+            given = [{k: v for k, v in row.items() if v not in (None, "")} for row in rows]
+            return cls._of([tuple((_DEFAULTS | row)[name] for name in _COLUMNS) for row in given])
 
     def frames_of(self, times: FloatArray, poses: FloatArray, where: str, drive: str) -> IntArray:
         """Return (R,) the index of the frame of each box: the nearest in time, -1 without one
@@ -199,12 +207,8 @@ class BoxTable:
         """
         path = Path(path)
         check_box_file("boxes_out", path)
-        columns = (
-            self.times.tolist(),
-            self.numbers.tolist(),
-            self.classes,
-            *self.values.T.tolist(),
-        )
+        values = [[None if isnan(v) else v for v in row] for row in self.values.T.tolist()]
+        columns = (self.times.tolist(), self.numbers.tolist(), self.classes, *values)
         rows = [dict(zip(_COLUMNS, row, strict=True)) for row in zip(*columns, strict=True)]
         text = io.StringIO()
         match path.suffix.lower():

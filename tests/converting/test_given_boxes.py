@@ -121,8 +121,8 @@ def test_bad_boxes_are_refused_in_one_line_before_anything_is_written(drive, tmp
     lines = (drive / "boxes.csv").read_text().splitlines()
     size = lines[1].split(",")
     size[6] = "0.0"
-    away = table.values + np.eye(11)[0] * 1000
-    near = table.values + np.eye(11)[2] * 5
+    away = table.values + np.eye(17)[0] * 1000
+    near = table.values + np.eye(17)[2] * 5
     for name, content, found in (
         ("no time", "\n".join(line.partition(",")[2] for line in lines), "time absent"),
         ("size", "\n".join([lines[0], ",".join(size)]), "0.0"),

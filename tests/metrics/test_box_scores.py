@@ -74,7 +74,8 @@ def drive(tmp_path_factory, request):
 def table_of(rows):
     """(frame, number, x, y, heading, confidence) of each box."""
     values = [
-        [x, y, 0, *SIZE, turn, SPEED_M_S, 0, 0, confidence] for _, _, x, y, turn, confidence in rows
+        [x, y, 0, *SIZE, turn, SPEED_M_S, 0, 0, confidence, *[np.nan] * 6]
+        for _, _, x, y, turn, confidence in rows
     ]
     return BoxTable(
         np.array([row[0] / 10 for row in rows]),

@@ -11,7 +11,7 @@ from numpy.testing import assert_array_equal
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.motion import BOX_ENDINGS, BoxTable
 
-ROW = [1.0, -2.0, 0.5, 4.5, 1.8, 1.5, 0.25, 3.0, 0.0, 0.1, 0.75]
+ROW = [1.0, -2.0, 0.5, 4.5, 1.8, 1.5, 0.25, 3.0, 0.0, 0.1, 0.75, 4.0, 1.7, 1.5, 6.0, 1.9, np.nan]
 TABLE = BoxTable(
     np.array([0.0, 0.1, 0.1]),
     np.array([7, 7, 8]),
@@ -28,13 +28,17 @@ def test_what_is_written_is_read(ending, tmp_path):
     read = BoxTable.read(tmp_path / f"boxes{ending}")
     for name, value in vars(TABLE).items():
         assert_array_equal(getattr(read, name), value)
+    if ending != ".parquet":
+        assert "nan" not in (tmp_path / f"boxes{ending}").read_text().lower()
 
 
-def test_velocity_and_confidence_may_be_absent(tmp_path):
+def test_velocity_confidence_and_intervals_may_be_absent(tmp_path):
     names = "time number class x y z length width height heading".split()
     row = dict(zip(names, [0.5, 3, "Car", 1, 2, 3, 4, 2, 1, 0], strict=True))
     (tmp_path / "a.json").write_text(json.dumps([row]))
-    assert_array_equal(BoxTable.read(tmp_path / "a.json").values[0, 7:], [np.nan] * 3 + [1])
+    assert_array_equal(
+        BoxTable.read(tmp_path / "a.json").values[0, 7:], [np.nan] * 3 + [1] + [np.nan] * 6
+    )
 
 
 CSV = "time,number,class,x,y,z,length,width,height,heading"
