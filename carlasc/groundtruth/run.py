@@ -147,7 +147,7 @@ def regrid(
             by the size and the time of each file, and by content where these differ; "content":
             by content; "never": existing frames are kept.
         boxes_out: .csv, .json or .parquet file of the boxes of the moving actors of one sequence,
-            which is replaced: one row per actor and scan, as `label_motion` writes it.
+            which is replaced: one row per actor and scan, in the frame of the poses, right-handed.
         run: how the work is spread, whether this is only a part of it, and what shows its progress.
             The last part to finish writes the report, and finishes a packed store.
 
