@@ -154,7 +154,7 @@ def evaluate(
         typer.Option(
             "--boxes",
             help="SOURCE is a table of boxes, which are scored by those of TRUTH: .csv, .json or "
-            ".parquet, as --boxes-out of label and map writes it.",
+            ".parquet, as --boxes-out of label and regrid writes it.",
         ),
     ] = False,
     name: Annotated[

@@ -65,8 +65,8 @@ class LayoutOptions:
         compare_inputs: how it is found out whether the data set changed since an earlier run:
             "fast": by the names, sizes and times of its files; "content": all frames are made
             again and compared; "never": existing frames are kept.
-        boxes: .csv, .json or .parquet file of the boxes of one recording, as `label` and `map`
-            write it, in the frame of the first scan; instead of the boxes of the data set.
+        boxes: .csv, .json or .parquet file of the boxes of one recording, as `label_motion` writes
+            it, in the frame of the first scan, right-handed; instead of those of the data set.
 
     Raises:
         ArgumentError: an unknown value of `axes`, `flow`, `images` or `compare_inputs`.

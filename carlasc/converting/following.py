@@ -46,6 +46,7 @@ from carlasc.errors import (
     MissingDataError,
     check_types,
     count,
+    only,
 )
 from carlasc.groundtruth.inputs import GridPlan, without_caches
 from carlasc.groundtruth.options import FromScans, GridOptions, Voting
@@ -152,11 +153,8 @@ class _Folder:
         while self.idle_s is None or waited < self.idle_s:
             fresh, times = list[FrameHandle](), None
             try:
-                (recording, *others) = find_recordings(self.converter)
-                if others:
-                    raise ArgumentError(
-                        "source", expected="one growing recording", found=str(1 + len(others))
-                    )
+                found = {one.location: one for one in find_recordings(self.converter)}
+                recording = only("source", found, "one growing recording")
                 places = [handle.location for handle in recording.frames]
                 start = places.index(last) + 1 if last in places else 0
                 fresh = [one for one in recording.frames[start:] if one.location not in taken]

@@ -4,7 +4,7 @@ from their files or estimated from their scans.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
@@ -158,10 +158,11 @@ class RecordingPlan(Examined):
             FormatError: they are those of another drive.
         """
         if self.given is not None and self.poses is not None:
-            self.boxes, note = self.given.at_scans(
-                self.recording, self.times, self.poses, check=not self.force
-            )
-            self.notes += note
+            self.boxes, notes = self.given.at_scans(self.recording, self.times, self.poses)
+            self.notes += notes
+            if not self.force:
+                frames = [one for one in self.recording.frames if one.number in self.boxes]
+                self.given.check(self.boxes, _some_scans(self.recording, frames))
 
     @property
     def rig(self) -> Rig:
@@ -289,7 +290,7 @@ def examine(
     """
     notes, findings = list[str | None](), list[Finding]()
     checked = recording.rays and (level or not known)
-    mount = find_mount(_some_scans(recording)) if checked else None
+    mount = find_mount([*_some_scans(recording).values()]) if checked else None
     if not level:
         findings += check_mount(mount, recording.location, force=False)
     elif mount is not None:
@@ -377,21 +378,24 @@ def _swapped(given: Trajectory) -> Trajectory | None:
     return replace(given, world_T_vehicle=given.other, other=None)
 
 
-def _some_scans(recording: Recording) -> list[Float32Array]:
-    """Return the points of some scans of a recording that can be read.
+def _some_scans(
+    recording: Recording, frames: Sequence[FrameHandle] = ()
+) -> dict[int, Float32Array]:
+    """Return the points of some scans of a recording that can be read, by frame number: of some
+    frames only, if any are given.
 
     Raises:
         FormatError: none of them is a scan: the error of the first one.
     """
-    rig, frames = replace(Rig.of(recording), rays=False), recording.frames
-    scans = list[Float32Array]()
+    rig, frames = replace(Rig.of(recording), rays=False), frames or recording.frames
+    scans = dict[int, Float32Array]()
     problem: FormatError | None = None
     for row in sorted({*np.linspace(0, len(frames) - 1, _SCANS).astype(int).tolist()}):
         with suppress(CarlascError, OSError):  # the conversion of the frame reports the error
             scan = read_scan(frames[row], rig, None)
             try:
                 check_scan(scan.points, scan.fields.get("seconds"), frames[row].location)
-                scans.append(scan.points)
+                scans[frames[row].number] = scan.points
             except FormatError as error:
                 problem = problem or error
     if problem is not None and not scans:

@@ -147,7 +147,7 @@ def regrid(
             by the size and the time of each file, and by content where these differ; "content":
             by content; "never": existing frames are kept.
         boxes_out: .csv, .json or .parquet file of the boxes of the moving actors of one sequence,
-            which is replaced: one row per actor and scan, as `label_motion` writes it.
+            which is replaced: one row per actor and scan, in the frame of the poses, right-handed.
         run: how the work is spread, whether this is only a part of it, and what shows its progress.
             The last part to finish writes the report, and finishes a packed store.
 
@@ -184,9 +184,10 @@ def regrid(
     except MissingDataError:
         if not others:
             raise
-    merged = [one for one in found if isinstance(one, ScanSequence) and one.feed.needs_actors]
+    merged = {one.path: one for one in found if isinstance(one, ScanSequence)}
     if boxes_out is not None:
-        only("boxes_out", {one.path: one for one in merged}, f"{ONE_FRAME}, with scans that move")
+        merged = {path: one for path, one in merged.items() if one.feed.needs_actors}
+        only("boxes_out", merged, f"{ONE_FRAME}, whose scans show actors that move")
         check_box_file("boxes_out", Path(boxes_out))
     jobs = [_prepare(one, sink, plan, compare_inputs, overwrite=overwrite) for one in found]
 
@@ -199,10 +200,8 @@ def regrid(
         work = Work(jobs, plan, pool)
         failures = work.run()
         if boxes_out is not None:
-            (one,) = merged
-            one.prepare(
-                jobs[found.index(one)].writer, pool, lambda steps: None
-            )  # unless a grid needed it
+            (one,) = merged.values()
+            one.prepare(jobs[0].writer, pool, lambda steps: None)  # unless a grid needed it
             one.actors = with_numbers(one.actors, one.feed)
             one.box_table(one.feed.frames.tolist()).write(boxes_out)
     # the caller may write more into its own sink

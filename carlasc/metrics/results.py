@@ -7,10 +7,8 @@ take sequences instead of frames, because the frames of one sequence show nearly
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -23,6 +21,7 @@ from carlasc.metrics.actor_scores import ActorScore
 from carlasc.metrics.confusion import ConfusionMatrix, json_number
 from carlasc.metrics.conventions import Convention, ConventionScore
 from carlasc.metrics.rays import RayScore
+from carlasc.storage.files import csv_text
 
 Cell = str | float
 Score = Callable[[ConfusionMatrix], float]
@@ -53,7 +52,7 @@ class FigureTable:
 
     def to_csv(self) -> str:
         """Return the table as CSV with a header."""
-        return _csv([self.header, *self.texts()])
+        return csv_text([self.header, *self.texts()])
 
     def to_markdown(self) -> str:
         """Return the table as Markdown, with the title above."""
@@ -76,12 +75,6 @@ class FigureTable:
         body = "\n".join([r"\toprule", lines[0], r"\midrule", *lines[1:], r"\bottomrule"])
         columns = "l" + "r" * (len(self.header) - 1)
         return f"% {self.title}\n\\begin{{tabular}}{{{columns}}}\n{body}\n\\end{{tabular}}\n"
-
-
-def _csv(rows: Iterable[Sequence[str]]) -> str:
-    buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerows(rows)
-    return buffer.getvalue()
 
 
 def _text(cell: Cell) -> str:
@@ -271,7 +264,7 @@ class Evaluation:
             values = [*(figures[name] for name in names), *frame.score.class_iou.values()]
             cells = ["" if math.isnan(value) else f"{value:.6f}" for value in values]
             rows.append([frame.sequence, frame.frame, *cells])
-        return _csv(rows)
+        return csv_text(rows)
 
     def to_dict(self) -> dict[str, Any]:
         """Return all scores by name, as fractions, for JSON; None for undefined scores."""

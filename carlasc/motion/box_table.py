@@ -26,7 +26,7 @@ from carlasc.errors import (
 )
 from carlasc.motion.bodies import BODY_MARGIN_M
 from carlasc.motion.tracks import Track
-from carlasc.storage.files import AnyPath, to_json, write_output
+from carlasc.storage.files import AnyPath, csv_text, to_json, write_output
 
 ONE_FRAME = "one sequence, as a table of boxes has one frame"
 """What is expected of the source, or of the output, of a table."""
@@ -208,24 +208,18 @@ class BoxTable:
         path = Path(path)
         check_box_file("boxes_out", path)
         values = [[None if isnan(v) else v for v in row] for row in self.values.T.tolist()]
-        columns = (self.times.tolist(), self.numbers.tolist(), self.classes, *values)
-        rows = [dict(zip(_COLUMNS, row, strict=True)) for row in zip(*columns, strict=True)]
-        text = io.StringIO()
+        own = (self.times.tolist(), self.numbers.tolist(), self.classes, *values)
+        columns, rows = dict(zip(_COLUMNS, own, strict=True)), zip(*own, strict=True)
         match path.suffix.lower():
             case ".json":
-                write_output(path, to_json(rows))
+                data = to_json([dict(zip(_COLUMNS, row, strict=True)) for row in rows])
             case ".csv":
-                written = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
-                written.writeheader()
-                written.writerows(rows)
-                write_output(path, text.getvalue().encode())
+                data = csv_text([_COLUMNS, *rows]).encode()
             case _:
-                made = io.BytesIO()
-                pa = import_extra("pyarrow", "parquet")
-                import_extra("pyarrow.parquet", "parquet").write_table(
-                    pa.Table.from_pylist(rows), made
-                )
-                write_output(path, made.getvalue())
+                made, table = io.BytesIO(), import_extra("pyarrow", "parquet").table(columns)
+                import_extra("pyarrow.parquet", "parquet").write_table(table, made)
+                data = made.getvalue()
+        write_output(path, data)
 
 
 def _rows_of(path: Path) -> list[dict[str, Any]]:

@@ -7,8 +7,10 @@ file, or the names in a folder, are on the disk.
 
 from __future__ import annotations
 
+import csv
 import errno
 import glob
+import io
 import json
 import os
 import re
@@ -323,6 +325,13 @@ def write_json(path: Path, value: Any) -> None:
 def to_json(value: Any) -> bytes:
     """Return `value` as the bytes of a JSON file."""
     return json.dumps(value).encode()
+
+
+def csv_text(rows: Iterable[Iterable[Any]]) -> str:
+    """Return rows as the text of a CSV file."""
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerows(rows)
+    return buffer.getvalue()
 
 
 def parse_json(data: bytes, where: str) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.converters import bags
 from helpers.converters.scan_writers import write_poses, write_scan
 from helpers.errors import raises
 from helpers.scenes.passing_car import SPEED_M_S, scan, sensor_pose, write_sequence
@@ -12,10 +13,13 @@ from typer.testing import CliRunner
 import carlasc
 from carlasc import FromScans, LayoutOptions, Run
 from carlasc.cli import app
-from carlasc.core.geometry import mirror_poses, transform_points
+from carlasc.core.boxes import mirror_boxes
+from carlasc.core.geometry import invert, mirror_poses, transform_points
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.motion import BoxTable, MotionOptions
 from carlasc.storage import FolderSource
+from carlasc.testing import KINDS, SimulatedDrive
+from carlasc.testing.drives import world_T_sensor
 
 ONE, FRAMES = Run(workers=1), 10
 BY_BOXES = FromScans(motion=MotionOptions("boxes"))
@@ -78,6 +82,13 @@ def test_boxes_that_were_written_are_read_and_the_same_actors_are_found(drive, t
     assert found.numbers.tolist() == table.numbers.tolist() and found.classes == table.classes
     assert np.allclose(found.times, table.times)
     assert np.abs(found.values[:, :3] - table.values[:, :3]).max() < 0.15
+    grids = {"out": tmp_path / "grids", "frames": "5:6", "boxes_out": tmp_path / "grids.json"}
+    carlasc.regrid(tmp_path / "out", "coarse", observe=BY_BOXES, run=ONE, **grids)
+    assert (tmp_path / "grids.json").read_bytes() == again.read_bytes()
+    with raises(ArgumentError, where="boxes_out", expected="actors that move"):
+        carlasc.regrid(
+            tmp_path / "out", "coarse", observe=FromScans(dynamic="tube"), run=ONE, **grids
+        )
     scores = carlasc.metrics.evaluate_boxes(drive / "boxes.csv", tmp_path / "out")
     assert {one.ap for one in scores.scores} == {1.0} and scores.left_out == 0
 
@@ -90,7 +101,7 @@ def test_the_command_takes_boxes_and_a_change_of_them_makes_frames_again(drive, 
     command += ["--frames", "0:4", "--workers", "1", "--boxes", str(boxes)]
     assert CliRunner().invoke(app, command).exit_code == 0
     first = sequence_in(tmp_path / "out").boxes(3)
-    wider = table.values + [*[0] * 4, 0.5, *[0] * 6]
+    wider = table.values + [*[0] * 4, 0.5, *[0] * 12]
     replace(table, values=wider).write(boxes)
     assert CliRunner().invoke(app, command).exit_code == 0
     assert sequence_in(tmp_path / "out").boxes(3).sizes[0, 1] == first.sizes[0, 1] + 0.5
@@ -128,8 +139,8 @@ def test_bad_boxes_are_refused_in_one_line_before_anything_is_written(drive, tmp
         ("size", "\n".join([lines[0], ",".join(size)]), "0.0"),
         ("twice", "\n".join([*lines, lines[4]]), "9.0"),
         ("class", "\n".join(lines).replace("Vehicle", "Spaceship"), "class 'Spaceship'"),
-        ("late", replace(table, times=table.times + 60), "60 to 60.9 s"),
-        ("away", replace(table, values=away), "none: the nearest is"),
+        ("late", replace(table, times=table.times + 60), "boxes at 60 to 60.9 s"),
+        ("away", replace(table, values=away), "the nearest 98"),
         ("air", replace(table, values=near), "no point in"),
     ):
         file = tmp_path / f"{name}.csv"
@@ -153,3 +164,38 @@ def test_bad_boxes_are_refused_in_one_line_before_anything_is_written(drive, tmp
             run=Run(sequences_from=tmp_path / "clips.txt"),
             grids=None,
         )
+
+
+@pytest.mark.slow
+@pytest.mark.needs("rosbags")
+def test_a_bag_gets_the_boxes_of_a_table(tmp_path):
+    drive, store = SimulatedDrive(6, channels=12, columns=90), bags.Messages("mcap")
+    bag = bags.write_bag(tmp_path, "mcap", bags.drive_messages(store, drive), store=store)
+    rows, expected = [], []
+    for frame, seconds in enumerate(drive.times.tolist()):
+        sensor_T_vehicle = invert(world_T_sensor(drive, frame)) @ drive.world_T_vehicle(seconds)
+        own = drive.boxes(frame, dict.fromkeys(KINDS, 10)).transform(sensor_T_vehicle)
+        expected.append(own)
+        first_T_sensor = invert(world_T_sensor(drive, 0)) @ world_T_sensor(drive, frame)
+        first = own.transform(first_T_sensor)
+        ahead = first.sensor_T_box[:, :2, 0]
+        for row, track in enumerate(first.tracks.tolist()):
+            heading = np.arctan2(ahead[row, 1], ahead[row, 0])
+            values = [*first.centers[row], *first.sizes[row], heading, *[np.nan] * 3, 1]
+            rows.append((seconds - drive.times[0], track, values))
+    times, numbers, values = zip(*rows, strict=True)
+    names = ("Vehicle",) * len(rows)
+    BoxTable(np.array(times), np.array(numbers), names, np.array(values)).write(tmp_path / "b.csv")
+    layout = LayoutOptions(boxes=tmp_path / "b.csv")
+    carlasc.convert("bag", bag, tmp_path / "out", layout=layout, grids=None, run=ONE)
+    for frame, own in enumerate(expected):
+        found = sequence_in(tmp_path / "out").boxes(frame)
+        assert set(found.tracks.tolist()) >= set(own.tracks.tolist())
+        order = np.argsort(own.tracks)
+        kept = found.select(np.isin(found.tracks, own.tracks))
+        assert np.allclose(
+            kept.select(np.argsort(kept.tracks)).centers,
+            mirror_boxes(own).centers[order],
+            atol=0.02,
+        )
+        assert kept.annotated.all()
