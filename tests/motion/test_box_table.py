@@ -77,3 +77,17 @@ def test_files_that_are_no_tables_are_named(tmp_path):
         BoxTable.read(tmp_path / "e.txt")
     with raises(FormatError, where="row 1"):
         replace(TABLE, values=np.zeros_like(TABLE.values))
+
+
+def test_a_box_is_of_the_frame_that_is_nearest_in_time_and_an_object_has_one_there():
+    times = np.array([0.0, 0.03, 0.06, 0.14, 0.2, 0.251, 0.1])
+    table = BoxTable(times, np.array([7] * 6 + [8]), ("Car",) * 7, np.array([ROW] * 7))
+    frames = np.array([0.0, 0.1, 0.2])
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    found = table.frames_of(frames, poses, "a.csv", "drive")
+    assert found.tolist() == [0, -1, 1, -1, 2, -1, 1]
+    with raises(FormatError, where="a.csv", expected="boxes at 1 to 1.2 s", found="0 to 0.251 s$"):
+        table.frames_of(frames + 1, poses, "a.csv", "drive")
+    poses[:, 0, 3] = 600
+    with raises(FormatError, where="a.csv", expected="within 500 m", found="599 m away"):
+        table.frames_of(frames, poses, "a.csv", "drive")
