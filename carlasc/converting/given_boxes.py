@@ -86,15 +86,16 @@ class GivenBoxes:
         return boxes, [f"{note}: {names}"] if len(out) else []
 
     def check(self, boxes: Mapping[int, Boxes], scans: Mapping[int, Float32Array]) -> None:
-        """Check that scans have points in boxes near the sensor; both are by frame number.
+        """Check that scans have points in the boxes near the sensor, or in the nearest one; both
+        are by frame number.
 
         Raises:
             FormatError: the boxes are those of another drive.
         """
         held = np.zeros(0, np.bool_)
         for number, points in scans.items():
-            own = boxes[number]
-            near = own.select(np.linalg.norm(own.centers, axis=1) < _NEAR_M)
+            away = np.linalg.norm(boxes[number].centers, axis=1)
+            near = boxes[number].select(away <= max(_NEAR_M, away.min()))
             held = np.append(held, near.contains(points[:, :3] - _FLOOR).any(axis=1))
         if len(held) and held.mean() < _HELD:
             raise FormatError(

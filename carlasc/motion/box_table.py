@@ -124,12 +124,12 @@ class BoxTable:
     @classmethod
     def _of(cls, rows: list[tuple[Any, ...]]) -> Self:
         """Return the table of rows with a value per column, numbers or text."""
-        times, numbers, classes = (
-            zip(*(row[:3] for row in rows), strict=True) if rows else ((),) * 3
+        return cls(
+            np.array([row[0] for row in rows], np.float64),
+            np.array([int(float(row[1])) for row in rows], np.int64),
+            tuple(str(row[2]) for row in rows),
+            np.array([row[3:] for row in rows], np.float64).reshape(-1, len(_NUMBERS)),
         )
-        values = np.array([row[3:] for row in rows], np.float64).reshape(-1, len(_NUMBERS))
-        whole = np.array([int(float(number)) for number in numbers], np.int64)
-        return cls(np.array(times, np.float64), whole, tuple(map(str, classes)), values)
 
     @classmethod
     def read(cls, path: AnyPath) -> Self:
@@ -156,7 +156,7 @@ class BoxTable:
                 path,
                 expected=f"boxes with the columns {', '.join(needed)}",
                 found=found,
-                advice="write it with `carlasc label --from motion --boxes-out` or `carlasc map`",
+                advice="write it with `--boxes-out` of `carlasc label` or `carlasc regrid`",
             )
         with reading(path, "numbers in all columns but class"), within(path):
             # what is empty in a file is absent
@@ -180,7 +180,7 @@ class BoxTable:
         apart = np.abs(times[index] - self.times)
         late = np.argsort(-apart, kind="stable").tolist()  # the nearest last, which is kept
         kept = np.array([*{(index[row], self.numbers[row]): row for row in late}.values()])
-        kept = kept[apart[kept] < _APART_S]
+        kept = kept[apart[kept] <= _APART_S]
         away = np.linalg.norm(self.values[kept, :3] - poses[index[kept], :3, 3], axis=1)
         nearest = away.min(initial=np.inf)
         if nearest > _FARTHEST_M:

@@ -319,7 +319,7 @@ def test_clouds_that_do_not_fit_are_named(cloud, problem):
 
 
 class Lab:
-    classes, to_carla, sensor = SEMANTICKITTI, TO_CARLA, None
+    classes, to_carla, keeps_classes, sensor = SEMANTICKITTI, TO_CARLA, False, None
     min_range_m = max_range_m = None
 
 

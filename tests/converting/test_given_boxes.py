@@ -133,7 +133,7 @@ def test_bad_boxes_are_refused_in_one_line_before_anything_is_written(drive, tmp
     size = lines[1].split(",")
     size[6] = "0.0"
     away = table.values + np.eye(17)[0] * 1000
-    near = table.values + np.eye(17)[2] * 5
+    near, beside = table.values + np.eye(17)[2] * 5, table.values + np.eye(17)[1] * 100
     for name, content, found in (
         ("no time", "\n".join(line.partition(",")[2] for line in lines), "time absent"),
         ("size", "\n".join([lines[0], ",".join(size)]), "0.0"),
@@ -142,6 +142,7 @@ def test_bad_boxes_are_refused_in_one_line_before_anything_is_written(drive, tmp
         ("late", replace(table, times=table.times + 60), "boxes at 60 to 60.9 s"),
         ("away", replace(table, values=away), "the nearest 98"),
         ("air", replace(table, values=near), "no point in"),
+        ("beside", replace(table, values=beside), "no point in 5 of 5 boxes"),
     ):
         file = tmp_path / f"{name}.csv"
         if isinstance(content, str):

@@ -8,8 +8,10 @@ import pytest
 from helpers.errors import raises
 from numpy.testing import assert_array_equal
 
+from carlasc import Boxes
+from carlasc.core.geometry import rotation_z, translation
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.motion import BOX_ENDINGS, BoxTable
+from carlasc.motion import BOX_ENDINGS, BoxTable, tracks_from_boxes
 
 ROW = [1.0, -2.0, 0.5, 4.5, 1.8, 1.5, 0.25, 3.0, 0.0, 0.1, 0.75, 4.0, 1.7, 1.5, 6.0, 1.9, np.nan]
 TABLE = BoxTable(
@@ -81,3 +83,43 @@ def test_files_that_are_no_tables_are_named(tmp_path):
         BoxTable.read(tmp_path / "e.txt")
     with raises(FormatError, where="row 1"):
         replace(TABLE, values=np.zeros_like(TABLE.values))
+
+
+def test_boxes_of_tracks_are_placed_in_the_frame_of_the_table():
+    turns, sizes = np.tile([1.0, 0, 0, 0], (1, 1)), np.array([[4.0, 2, 1]])
+    boxes = {
+        frame: Boxes(
+            np.array([3], np.uint32),
+            np.array([2], np.uint32),
+            np.array([[10.0 * frame, 5, 0]]),
+            turns,
+            sizes,
+            np.array([True]),
+        )
+        for frame in range(5)
+    }
+    poses, times = dict.fromkeys(boxes, np.eye(4)), {frame: 1.0 * frame for frame in boxes}
+    (track,) = tracks_from_boxes(boxes, poses, times)
+    table_T_world = translation((0, 0, 1)) @ rotation_z(np.pi / 2)
+    frames = {frame: (times[frame], table_T_world) for frame in boxes}
+    table = BoxTable.of_tracks({8: track}, frames, {2: "Car"}, left=False)
+    assert table.numbers.tolist() == [8] * 5 and table.classes == ("Car",) * 5
+    assert np.allclose(table.values[3, :3], [-5, 30, 1], atol=0.1)
+    assert np.allclose(table.values[3, 6:10], [np.pi / 2, 0, 10, 0], atol=0.1)
+    left = BoxTable.of_tracks({8: track}, frames, {2: "Car"}, left=True, numbers={8: 3})
+    assert set(left.numbers.tolist()) == {3}
+    assert np.allclose(left.values[3, :3], [-5, -30, 1], atol=0.1)
+
+
+def test_a_box_is_of_the_frame_that_is_nearest_in_time_and_an_object_has_one_there():
+    times = np.array([0.0, 0.03, 0.07, 0.14, 0.2, 0.251, 0.1])
+    table = BoxTable(times, np.array([7] * 6 + [8]), ("Car",) * 7, np.array([ROW] * 7))
+    frames = np.array([0.0, 0.1, 0.2])
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    found = table.frames_of(frames, poses, "a.csv", "drive")
+    assert found.tolist() == [0, -1, 1, -1, 2, -1, 1]
+    with raises(FormatError, where="a.csv", expected="boxes at 1 to 1.2 s", found="0 to 0.251 s$"):
+        table.frames_of(frames + 1, poses, "a.csv", "drive")
+    poses[:, 0, 3] = 600
+    with raises(FormatError, where="a.csv", expected="within 500 m", found="599 m away"):
+        table.frames_of(frames, poses, "a.csv", "drive")
