@@ -15,6 +15,7 @@ import shutil
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ import study
 from numpy.typing import NDArray
 
 SCANS = (500, 2000, 10_000)
-CHANNELS, COLUMNS = 16, 360
+CHANNELS, COLUMNS = 16, 180
 _HEIGHT_M, _FAR_M, _NOISE_M = 1.8, 60.0, 0.02
 _HOUSE_M, _POLE_M, _PARKED_M, _TRAFFIC_M = 14.0, 23.0, 17.0, 60.0
 _LOOK_S = 2.0
@@ -93,13 +94,12 @@ def write(scans: int, folder: Path) -> None:
 
 def size_of(folder: Path) -> int:
     """Return the bytes of the files in a folder, some of which may vanish meanwhile."""
-    total = 0
-    for place, _, names in os.walk(folder):
-        for name in names:
-            try:
-                total += os.stat(os.path.join(place, name)).st_size
-            except FileNotFoundError:
-                continue
+    total, folders = 0, [folder]
+    while folders:
+        for path in folders.pop().iterdir():
+            with suppress(FileNotFoundError):
+                total += 0 if path.is_dir() else path.stat().st_size
+            folders += [path] if path.is_dir() else []
     return total
 
 

@@ -202,7 +202,7 @@ def test_a_map_that_is_killed_goes_on_from_what_it_kept(recording, tmp_path, is_
         *((("*/recording-a.ply/*.bin", "3", signal.SIGINT, []),) if is_recording else ()),
         ("*.a.ply.*.part", "1", signal.SIGKILL, []),
         ("*/tracks-*.npz", "1", signal.SIGKILL, ["poses"]),
-        ("*a.ply", "2", signal.SIGKILL, ["poses", "tracks"]),
+        ("*a.ply", "1", signal.SIGKILL, ["poses", "tracks"]),
     ):
         began = [sys.executable, "-c", ENDS_ITSELF, pattern, number, str(int(ending)), *call]
         run = subprocess.run([*began, "a.ply"], cwd=tmp_path, capture_output=True, check=False)

@@ -152,7 +152,7 @@ class GrowingCells:
         if self._held > self.most_rows:
             for part, added in self._rows.items():
                 self._rows[part] = [_added(added)]
-            self._held = sum(len(rows) for rows, in self._rows.values())
+            self._held = sum(len(rows) for (rows,) in self._rows.values())
             while self._held > self.most_rows // 2:  # the least recent ones first
                 part, (rows,) = self._rows.popitem(last=False)
                 self._held -= len(rows)
