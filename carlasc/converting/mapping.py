@@ -238,8 +238,10 @@ def map(
     try:
         if grid is None:
             spread = replace(run, progress=steps.stage())
-            given = drive, files, wanted, cell_m, motion, poses, keep_parked
-            content = write_map(*given, FolderWriter(place), spread)
+            writer = FolderWriter(place)
+            content = write_map(
+                drive, files, wanted, cell_m, motion, poses, keep_parked, writer, spread
+            )
         else:
             content = write_grid(drive, grid, wanted, files)
     except CarlascError as error:

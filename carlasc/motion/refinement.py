@@ -243,8 +243,8 @@ def refine_poses(
                 poses[begin:end], refined[begin:end] = aligned[rows], True
             after[begin:end] = now if chosen else before[begin:end]
             if keep is not None and end < count:
-                own = given, poses, before, after, refined, fits
-                keep(RefinedPoses(*(array[:end] for array in own)))
+                measures = before[:end], after[:end], refined[:end], fits[:end]
+                keep(RefinedPoses(given[:end], poses[:end], *measures))
         if submaps is not None:
             for row, scan, pose in zip(
                 range(begin, end), kept[rows], poses[begin:end], strict=True
