@@ -2,7 +2,7 @@
 a drive: memory, processor time and disk of `carlasc map`.
 
 The drive goes straight on through a street of boxes: houses, poles, parked cars, and cars that come
-towards the sensor or overtake it, which makes a scan of `CHANNELS` times `COLUMNS` rays per metre.
+towards the sensor or overtake it. There is a scan of `CHANNELS` times `COLUMNS` rays per metre.
 Scans are bare files: `carlasc map` converts them, estimates poses, refines them, finds what moves
 and writes the map, in one process. Memory is the greatest resident set of this process. Disk is
 what the map, the cells beside it and the hidden folder take together, without the scans.
@@ -22,7 +22,7 @@ import numpy as np
 import study
 from numpy.typing import NDArray
 
-SCANS = (500, 2000, 10_000)
+SCANS = (500, 10_000)
 CHANNELS, COLUMNS = 16, 180
 _HEIGHT_M, _FAR_M, _NOISE_M = 1.8, 60.0, 0.02
 _HOUSE_M, _POLE_M, _PARKED_M, _TRAFFIC_M = 14.0, 23.0, 17.0, 60.0
