@@ -133,8 +133,9 @@ def map(
     class with one more vote against it: 0.5 for a cell that one scan saw. Moving points are found
     as in `regrid`. With `grid`, the map is a grid of one frame instead, in the frame of its sensor.
 
-    A recording is converted first, as by `convert`, into a hidden folder beside the map. After an
-    interruption, the same call continues there; the folder is removed when the map is written.
+    A recording is converted first, as by `convert`, into a hidden folder beside the map, which also
+    keeps refined poses and found actors. After an interruption, the same call continues there; the
+    folder is removed when the map is written.
 
     Args:
         source: a data set with one sequence: anything that `carlasc.open` takes, or a source; or
@@ -245,7 +246,10 @@ def map(
     try:
         if grid is None:
             spread = replace(run, progress=steps.stage())
-            content = write_map(drive, files, wanted, cell_m, motion, poses, keep_parked, spread)
+            writer = FolderWriter(place)
+            content = write_map(
+                drive, files, wanted, cell_m, motion, poses, keep_parked, writer, spread
+            )
         else:
             content = write_grid(drive, grid, wanted, files)
     except CarlascError as error:
@@ -254,8 +258,8 @@ def map(
         raise
     record.write(keeper, kept)
     notes = (*(made.notes if made else ()), *content.notes)
+    shutil.rmtree(place, ignore_errors=True)
     if made is not None and keep is None:
-        shutil.rmtree(place)
         notes = tuple(note.replace(made.sequences[0], str(root)) for note in notes)
     return MapResult(
         tuple(str(path) for path in files.all),

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from carlasc.core.arrays import BoolArray, FloatArray, IntArray
+from carlasc.core.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from carlasc.core.geometry import (
     Transform,
     invert,
@@ -116,7 +116,7 @@ class ActorFollower:
                 observations.
             default_label: class of actors without labels.
         """
-        self.moved: dict[int, IntArray] = {}
+        self.moved: dict[int, Int32Array] = {}
         self.own: list[FloatArray] = []
         self.riders: set[int] = set()
         self.seen = 0
@@ -125,7 +125,7 @@ class ActorFollower:
         self._cells: dict[int, list[IntArray]] = {}
         self._poses: list[Transform] = []
         self._grounds: list[float] = []
-        self._close: list[tuple[int, IntArray, IntArray]] = []
+        self._close: list[tuple[int, Int32Array, IntArray]] = []
         self._deformable, self._label, self._number = deformable, default_label, first_instance
         self._alive: list[_ActorChain] = []
 
@@ -133,7 +133,8 @@ class ActorFollower:
         """Add the evidence of the next scan, and return the actors with enough evidence that ended
         before it.
         """
-        self.moved[scan.frame] = np.sort(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
+        moved = np.sort(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
+        self.moved[scan.frame] = moved.astype(np.int32)
         self.seen += scan.count
         self._poses.append(scan.world_T_sensor)
         if np.isfinite(scan.ground_m):
@@ -145,7 +146,7 @@ class ActorFollower:
             cells = cells_around(local)
             self._freed[cells] += 1
             if len(cells) and np.abs(local).max() < OWN_REACH_M:
-                self._close.append((scan.frame, members, cells))
+                self._close.append((scan.frame, members.astype(np.int32), cells))
         before, self._alive = self._alive, []
         ended = list[_ActorChain]()
         for one in before:

@@ -185,6 +185,8 @@ def refine_poses(
     always: bool = False,
     loops: LoopMode = "auto",
     steps: Callable[[int], None] | None = None,
+    begun: RefinedPoses | None = None,
+    keep: Callable[[RefinedPoses], None] | None = None,
 ) -> RefinedPoses:
     """Refine the poses of a drive.
 
@@ -197,6 +199,8 @@ def refine_poses(
         always: whether stretches are also refined where scans do not agree better afterwards.
         loops: whether loops are closed: see `carlasc.motion.loops`.
         steps: called with the number of scans that were read since the last call.
+        begun: the poses of the first scans, which an earlier call gave to `keep`.
+        keep: called with the poses of the first scans, after each stretch but the last one.
     """
     count, poses = len(given), given.copy()
     before, after, refined = (
@@ -205,6 +209,10 @@ def refine_poses(
         np.zeros(count, np.bool_),
     )
     fits = np.ones(count, np.bool_)
+    done = 0 if begun is None else len(begun.poses)
+    if begun is not None:
+        poses[:done], before[:done], after[:done] = begun.poses, begun.before_m, begun.after_m
+        refined[:done], fits[:done] = begun.refined, begun.fits
     scans, kept, first = iter(scans), list[ThinnedScan](), 0
     begin, submaps = 0, Submaps() if loops == "auto" and _may_return(given) else None
     while begin < count and count >= MIN_SCANS:
@@ -217,20 +225,26 @@ def refine_poses(
                 steps(1)
         first = start
         near, rows = slice(start, last), slice(begin - start, end - start)
-        if refined.any():  # start with the correction of the previous scan
-            poses[begin:last] = multiply(
-                poses[begin - 1], invert(given[begin - 1]), given[begin:last]
+        if end > done:
+            if refined.any():  # start with the correction of the previous scan
+                poses[begin:last] = multiply(
+                    poses[begin - 1], invert(given[begin - 1]), given[begin:last]
+                )
+            held = poses[near].copy()
+            aligned = align([scan.used for scan in kept], held, given[near], begin - start)
+            measured = [scan.measured for scan in kept]
+            before[begin:end] = disagreement(measured, given[near])[rows]
+            now = disagreement(measured, aligned)[rows]
+            fits[begin:end] = _is_near(held, aligned) and _fit(
+                [scan.used for scan in kept], aligned
             )
-        held = poses[near].copy()
-        aligned = align([scan.used for scan in kept], held, given[near], begin - start)
-        measured = [scan.measured for scan in kept]
-        before[begin:end] = disagreement(measured, given[near])[rows]
-        now = disagreement(measured, aligned)[rows]
-        fits[begin:end] = _is_near(held, aligned) and _fit([scan.used for scan in kept], aligned)
-        chosen = fits[begin] and (always or _is_better(before[begin:end], now))
-        if chosen:
-            poses[begin:end], refined[begin:end] = aligned[rows], True
-        after[begin:end] = now if chosen else before[begin:end]
+            chosen = fits[begin] and (always or _is_better(before[begin:end], now))
+            if chosen:
+                poses[begin:end], refined[begin:end] = aligned[rows], True
+            after[begin:end] = now if chosen else before[begin:end]
+            if keep is not None and end < count:
+                measures = before[:end], after[:end], refined[:end], fits[:end]
+                keep(RefinedPoses(given[:end], poses[:end], *measures))
         if submaps is not None:
             for row, scan, pose in zip(
                 range(begin, end), kept[rows], poses[begin:end], strict=True

@@ -187,24 +187,35 @@ main()
 
 
 @pytest.mark.slow
-def test_a_map_that_is_killed_goes_on_from_what_it_kept(recording, tmp_path):
-    """The moments are those at which files appear: the third scan, and the cells of the map."""
+@pytest.mark.parametrize("is_recording", [True, False])
+def test_a_map_that_is_killed_goes_on_from_what_it_kept(recording, tmp_path, is_recording):
+    """The moments are those at which files appear: the third scan, the actors when poses are kept,
+    and the map when both are.
+    """
     call = ["map", str(recording / "scans"), "--converter", "scans", "--force", "--workers", "1"]
     call += ["--pose-file", str(recording / "poses.txt")]
-    kept = tmp_path / ".carlasc" / "recording-a.ply"
-    for pattern, number, ending in (
-        ("*/recording-a.ply/*.bin", "3", signal.SIGINT),
-        ("*.a.ply.*.part", "1", signal.SIGKILL),
+    if not is_recording:
+        make(recording, tmp_path / "other.ply", keep=tmp_path / "kept")
+        call = ["map", str(tmp_path / "kept"), "--force", "--workers", "1"]
+    kept, found = tmp_path / ".carlasc" / "recording-a.ply", dict[str, int]()
+    for pattern, number, ending, names in (
+        *((("*/recording-a.ply/*.bin", "3", signal.SIGINT, []),) if is_recording else ()),
+        ("*/tracks-*.npz", "1", signal.SIGKILL, ["poses"]),
+        ("*a.ply", "1", signal.SIGKILL, ["poses", "tracks"]),
     ):
         began = [sys.executable, "-c", ENDS_ITSELF, pattern, number, str(int(ending)), *call]
         run = subprocess.run([*began, "a.ply"], cwd=tmp_path, capture_output=True, check=False)
         said = run.stderr.decode()
         assert run.returncode == (130 if ending == signal.SIGINT else -ending), said
-        assert not (tmp_path / "a.ply").exists() and any(kept.rglob("*.bin"))
+        assert not (tmp_path / "a.ply").exists() and any(kept.rglob("*.bin")) == is_recording
         assert ending != signal.SIGINT or "same command" in said, said
+        now = {path.name: path.stat().st_ino for path in kept.rglob(".carlasc/*.npz")}
+        assert sorted(name.partition("-")[0] for name in now) == names
+        assert found.items() <= now.items()  # what was kept was not made again
+        found = now
     call = [sys.executable, "-m", "carlasc", *call]
     for name in ("a.ply", "b.ply"):
         subprocess.run([*call, name], cwd=tmp_path, check=True)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".carlasc", "a.ply", "b.ply"]
+    assert [path.name for path in tmp_path.glob(".*")] == [".carlasc"]
     assert not [path for path in (tmp_path / ".carlasc").iterdir() if path.is_dir()]

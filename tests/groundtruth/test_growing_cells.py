@@ -1,6 +1,6 @@
 """The cells of a map do not depend on the order of scans, nor on how many fit into memory."""
 
-import errno
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +9,7 @@ from numpy.testing import assert_array_equal
 
 from carlasc.errors import StorageError
 from carlasc.groundtruth.maps.growing_cells import (
+    ROW_DTYPE,
     STATIC,
     GrowingCells,
     cells_of,
@@ -94,11 +95,21 @@ def test_a_scan_without_points_adds_nothing(tmp_path):
 
 
 def test_a_full_disk_is_named_with_the_file(tmp_path, monkeypatch):
-    def full(path, array):
-        raise OSError(errno.ENOSPC, "No space left on device")  # as NumPy raises it: without a name
-
-    monkeypatch.setattr(np, "save", full)
+    monkeypatch.setattr(GrowingCells, "_path", lambda *_: Path("/dev/full"))
     out = tmp_path / "map.ply"
-    with raises(StorageError, where=str(out)), temporary_folder(out) as folder:
-        filled(folder / "cells", scans(2), 10**9)
+    for most_rows in (10, 10**9):
+        with raises(StorageError, where=str(out)), temporary_folder(out) as folder:
+            filled(folder / "cells", scans(2), most_rows)
     assert not list(tmp_path.iterdir())
+
+
+def test_rows_of_a_place_that_is_seen_again_and_again_do_not_fill_the_disk(tmp_path):
+    (tmp_path / "a").mkdir()
+    cells, most = GrowingCells(tmp_path / "a", CELL_M, 1000), 0
+    (points, labels), *_ = scans(1)
+    far = points + (500.0, 0, 0)
+    for _ in range(60):
+        for own in (points, far):
+            cells.add(split(*rows_of_scan(own, labels, None, STATIC, CELL_M)) * 2)
+        most = max(most, sum(path.stat().st_size for path in (tmp_path / "a").iterdir()))
+    assert 0 < most <= 3 * 600 * ROW_DTYPE.itemsize

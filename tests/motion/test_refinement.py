@@ -9,6 +9,7 @@ import pytest
 
 from carlasc.core.geometry import invert, transform_points
 from carlasc.errors import ArgumentError, FormatError
+from carlasc.motion import refinement
 from carlasc.motion.joint_alignment import align, clusters, move
 from carlasc.motion.refinement import RefinedPoses, ThinnedScan, disagreement, refine_poses
 from carlasc.motion.solving import solve_positive
@@ -95,6 +96,19 @@ class TestStreet:
         scans, true = street
         moved, _ = errors(refine(scans, true, always=True).poses, true)
         assert 0 < moved.max() < 0.01
+
+    @pytest.mark.parametrize("row", ["drift", None])
+    def test_finished_stretches_are_not_aligned_again(self, street, row, monkeypatch):
+        scans, true = street
+        given = wrong_poses(true, **ROWS[row], seed=3) if row else true
+        kept, aligned = [], []
+        whole = refine(scans, given, keep=lambda begun: kept.append(begun.to_bytes("a")))
+        (begun,) = (RefinedPoses.from_bytes(data, "a")[0] for data in kept)
+        assert 0 < len(begun.poses) < len(true)
+        count = lambda *args: aligned.append(0) or align(*args)  # noqa: E731
+        monkeypatch.setattr(refinement, "align", count)
+        assert refine(scans, given, begun=begun).to_bytes("a") == whole.to_bytes("a")
+        assert len(aligned) == 1
 
     def test_over_the_whole_drive_the_given_poses_hold(self, street):
         scans, true = street

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from carlasc.core.arrays import AnyIntArray, IntArray
+from carlasc.core.arrays import AnyIntArray, Int32Array, IntArray
 from carlasc.core.geometry import invert, multiply, thin, transform_points
 from carlasc.errors import CarlascError, count
 from carlasc.groundtruth.from_scans.feed import ScanFeed
@@ -47,8 +47,10 @@ from carlasc.storage.protocol import Sequence as StoredScans
 from carlasc.storage.protocol import SequenceWriter
 from carlasc.storage.resuming import derived_key, read_derived
 
-TRACKS, POSES = "tracks", "poses"
-"""The names of the files with actors and with refined poses, in the folder of derived results."""
+TRACKS, POSES, STRETCHES = "tracks", "poses", "stretches"
+"""The names of the files with actors, with refined poses, and with those of the first stretches of
+a drive until all are refined, in the folder of derived results.
+"""
 
 # of the methods: a version changes only when the same input gives another result
 _VERSIONS = {
@@ -213,16 +215,17 @@ def _estimate(feed: ScanFeed, run: Run, actors: Iterable[_Observed]) -> list[Tra
         return list(tracks)
 
 
-def _untracked(moved: dict[int, IntArray], tracks: list[Track]) -> dict[int, AnyIntArray]:
+def _untracked(moved: dict[int, Int32Array], tracks: list[Track]) -> dict[int, AnyIntArray]:
     """Return the moved points of each frame that belong to no track."""
     tracked: dict[int, list[AnyIntArray]] = {}
     for track in tracks:
         for frame, members in track.members.items():
             tracked.setdefault(frame, []).append(members)
-    nothing = np.empty(0, np.int64)
-    own = {frame: np.concatenate([nothing, *tracked.get(frame, [])]) for frame in moved}
+    nothing = np.empty(0, np.int32)
     return {
-        frame: points[~np.isin(points, own[frame], kind="table")].astype(np.int32)
+        frame: points[
+            ~np.isin(points, np.concatenate([nothing, *tracked.get(frame, [])]), kind="table")
+        ]
         for frame, points in moved.items()
     }
 
@@ -299,6 +302,11 @@ class Kept:
             None if self.writer is None else read_derived(self.writer, self.name, self.key, parse)
         )
 
+    def write(self, made: RefinedPoses | MovingActors) -> None:
+        """Keep a result."""
+        if self.writer is not None:
+            self.writer.write_document(self.document, made.to_bytes(self.key))
+
     @property
     def document(self) -> str:
         """Name of the file in the folder of the sequence."""
@@ -327,11 +335,20 @@ def refine_sequence(
         steps(len(frames))
         return refined
     given = np.stack([feed.pose(frame) for frame in frames])
+    begun = replace(file, name=STRETCHES)
     with _each(partial(_thin_scan, feed=feed), frames, run) as scans:
-        always = options.refine == "always"
-        refined = refine_poses(scans, given, always=always, loops=options.loops, steps=steps)
+        refined = refine_poses(
+            scans,
+            given,
+            always=options.refine == "always",
+            loops=options.loops,
+            steps=steps,
+            begun=begun.read(RefinedPoses.from_bytes),
+            keep=begun.write,
+        )
+    file.write(refined)
     if writer is not None:
-        writer.write_document(file.document, refined.to_bytes(file.key))
+        writer.remove_document(begun.document)
     return refined
 
 

@@ -264,8 +264,7 @@ class ScanSequence(StoredSequence):
             kept = file.read(MovingActors.from_bytes)
             if kept is None:
                 self.actors = find_actors(feed, run, steps)
-                if writer is not None:
-                    writer.write_document(file.document, self.actors.to_bytes(file.key))
+                file.write(self.actors)
             else:
                 self.actors = kept
                 steps(feed.reads_for_actors)

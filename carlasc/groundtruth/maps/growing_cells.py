@@ -43,7 +43,8 @@ _SIDE, _MIDDLE = 1 << _SIDE_BITS, 1 << (_HEIGHT_BITS - 1)
 _STEPS, _VOTE = 1024, 65535
 # least distance of points from the faces of a cell, so that float32 rounding keeps them inside
 _EDGE = 1 / 64
-_MOST_ROWS = 4_000_000  # in memory: 200 MB
+_MOST_ROWS = 1_000_000  # in memory: 48 MB
+_REPEATED = 2  # rows of a part on disk, over those that are left when they are summed
 
 
 def rows_of_scan(
@@ -139,7 +140,8 @@ class GrowingCells:
         self.counts: dict[Part, int] = {}
         self._rows: OrderedDict[Part, list[AnyArray]] = OrderedDict()
         self._held = 0
-        self._stored: set[Part] = set()
+        # of each part on disk: its rows, and how many they are at most until they are summed
+        self._stored: dict[Part, tuple[int, int]] = {}
 
     def add(self, pieces: Iterable[tuple[Part, AnyArray]]) -> None:
         """Add the cells of some scans: see `split`."""
@@ -148,23 +150,31 @@ class GrowingCells:
             self._rows.move_to_end(part)
             self._held += len(rows)
         if self._held > self.most_rows:
-            self._rows = OrderedDict((part, [_added(rows)]) for part, rows in self._rows.items())
-            self._held = sum(len(rows[0]) for rows in self._rows.values())
+            for part, added in self._rows.items():
+                self._rows[part] = [_added(added)]
+            self._held = sum(len(rows) for (rows,) in self._rows.values())
             while self._held > self.most_rows // 2:  # the least recent ones first
                 part, (rows,) = self._rows.popitem(last=False)
                 self._held -= len(rows)
-                self._save(part, self._whole(part, [rows]))
-                self._stored.add(part)
+                self._store(part, rows)
 
-    def _save(self, part: Part, rows: AnyArray) -> None:
-        """Write the rows of a part."""
-        np.save(self._path(part), rows)
+    def _store(self, part: Part, rows: AnyArray) -> None:
+        """Append rows to those of a part on disk, and sum these when many of them are repeated."""
+        stored, most = self._stored.get(part, (0, _REPEATED * len(rows)))
+        mode = "ab"
+        if stored + len(rows) > most:
+            rows, stored, mode = self._whole(part, [rows]), 0, "wb"
+            most = _REPEATED * len(rows)
+        with self._path(part).open(mode) as file:
+            rows.tofile(file)
+        self._stored[part] = stored + len(rows), most
 
     def _path(self, part: Part) -> Path:
-        return self.folder / f"{'_'.join(map(str, part))}.npy"
+        return self.folder / "_".join(map(str, part))
 
     def _whole(self, part: Part, rows: list[AnyArray]) -> AnyArray:
-        return _added([np.load(self._path(part)), *rows] if part in self._stored else rows)
+        stored = [np.fromfile(self._path(part), ROW_DTYPE)] if part in self._stored else []
+        return _added([*stored, *rows])
 
     def finish(self) -> None:
         """Elect the class of each cell.
@@ -174,7 +184,7 @@ class GrowingCells:
         for part in sorted({*self._rows, *self._stored}):
             points = self._elect(part, self._whole(part, self._rows.pop(part, [])))
             self.counts[part] = len(points)
-            self._save(part, points)
+            points.tofile(self._path(part))
 
     def _elect(self, part: Part, rows: AnyArray) -> AnyArray:
         """Return one point per cell: the mean of its points, with the class with most votes, the
@@ -200,7 +210,7 @@ class GrowingCells:
         """Yield the points of a group, tile by tile, after `finish`."""
         for part in self.counts:
             if part[0] == group:
-                yield np.load(self._path(part))
+                yield np.fromfile(self._path(part), POINT_DTYPE)
 
 
 def _indices(part: Part, cells: IntArray) -> IntArray:

@@ -48,7 +48,7 @@ from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.files import temporary_folder, to_json, write_atomic, writing_folder
-from carlasc.storage.protocol import Source
+from carlasc.storage.protocol import SequenceWriter, Source
 
 
 class MapContent(NamedTuple):
@@ -77,15 +77,16 @@ def write_map(
     motion: MotionOptions,
     poses: PoseOptions,
     keep_parked: bool,
+    writer: SequenceWriter,
     run: Run,
 ) -> MapContent:
-    """Write the map of the one drive of a source. For the arguments and errors, see
-    `carlasc.map`.
+    """Write the map of the one drive of a source; `writer` keeps refined poses and actors. For the
+    other arguments and errors, see `carlasc.map`.
     """
     options = FromScans(window=(0, 0), motion=motion, poses=poses)
     with temporary_folder(files.all[0]) as folder:  # of cells that do not fit into memory
         drive = DriveMap.of(source, frames, options, GrowingCells(folder, cell_m))
-        drive.fill(run, files.actors is not None, keep_parked)
+        drive.fill(writer, run, files.actors is not None, keep_parked)
         points, bodies = drive.write(files), 0
         if files.trajectory is not None:
             drive.write_trajectory(files.trajectory)
@@ -138,15 +139,18 @@ class DriveMap:
         view = WithoutScans(sequence, hidden) if hidden else sequence
         return cls(ScanSequence(view, plan, options), chosen, cells)
 
-    def fill(self, run: Run, actors: bool, keep_parked: bool = False) -> None:
+    def fill(
+        self, writer: SequenceWriter, run: Run, actors: bool, keep_parked: bool = False
+    ) -> None:
         """Refine poses, find moving actors and, unless they are kept, parked ones that leave, and
-        add the static points of each scan; with `actors`, add the points of actors too.
+        add the static points of each scan; with `actors`, add the points of actors too. `writer`
+        keeps poses and actors.
         """
         inputs = self.inputs
         progress = StepCounter(run.progress, inputs.steps_before + len(self.frames))
         progress(0)
         with one_pool(run) as pool:
-            inputs.prepare(None, pool, progress)
+            inputs.prepare(writer, pool, progress)
             gone = np.empty(0, np.int64)
             if inputs.feed.motion and not keep_parked:
                 gone, self.parked = self._find_gone(pool, progress)
