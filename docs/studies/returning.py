@@ -6,28 +6,51 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from carlasc_recorders import TownActor, TownDrive
 from carlasc_recorders.town.actors import Population
-from carlasc_recorders.town.streets import HALF_ROAD_M, right_of
+from carlasc_recorders.town.streets import HALF_ROAD_M, Streets, right_of
 from numpy.typing import NDArray
 
 from carlasc.captures import Lidar
 from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.storage.layout import FRAME_PERIOD_S
 
+class Route(NamedTuple):
+    """Where a drive leads, and how fast.
+
+    Attributes:
+        crossings: (row, column) of each crossing at which it begins, turns or ends.
+        fast_m_s: speed on straight streets.
+        change_m_s2: how fast the speed changes; by default at once.
+    """
+
+    crossings: list[tuple[int, int]]
+    fast_m_s: float = 10.0
+    change_m_s2: float = 1e3
+
+
+_ROUND = [(1, 1), (3, 1), (3, 3), (1, 3), (1, 2), (3, 2), (3, 1)]
+_OTHER_WAY = [(1, 1), (1, 3), (3, 3), (3, 2), (1, 2)]
 ROUTES = {
-    "block": [(0, 1), (4, 1), (4, 2), (0, 2), (0, 1), (1, 1)],
-    "there and back": [(0, 0), (0, 1), (4, 1), (4, 2), (0, 2), (0, 1), (0, 0)],
-    "eight": [(1, 2), (4, 2), (4, 1), (0, 1), (0, 2), (4, 2), (4, 3), (0, 3), (0, 2), (2, 2)],
-    "laps": [*[(0, 0), (4, 0), (4, 4), (0, 4)] * 3, (0, 0), (2, 0)],
+    "block": Route([(0, 1), (4, 1), (4, 2), (0, 2), (0, 1), (1, 1)]),
+    "there and back": Route([(0, 0), (0, 1), (4, 1), (4, 2), (0, 2), (0, 1), (0, 0)]),
+    "eight": Route(
+        [(1, 2), (4, 2), (4, 1), (0, 1), (0, 2), (4, 2), (4, 3), (0, 3), (0, 2), (2, 2)]
+    ),
+    "laps": Route([*[(0, 0), (4, 0), (4, 4), (0, 4)] * 3, (0, 0), (2, 0)]),
+    "small eight": Route([(1, 2), (3, 2), (3, 3), (2, 3), (2, 1), (1, 1), (1, 2), (2, 2)]),
+    "other way": Route([(2, 1), (1, 1), (1, 2), (2, 2), (2, 3), (1, 3), (1, 1), (2, 1)]),
+    "many blocks": Route([*[*_ROUND, *_OTHER_WAY] * 2, (1, 1), (2, 1)], 15.0, 4.0),
 }
-"""The crossings, (row, column), of drives of 0.7, 0.8, 1.5 and 3.5 km."""
+"""Drives of 0.7, 0.8, 1.5, 3.5, 0.7, 0.6 and 3 km."""
 _COLUMNS = 5
 _STEP_M = 0.1  # of the path
 _CORNER_M = 9.0  # from a crossing, where a turn begins
-_FAST_M_S, _SIDEWAYS_M_S2 = 10.0, 2.5
+_SIDEWAYS_M_S2 = 2.5
 
 
 class _OnRoute(Population):
@@ -56,8 +79,8 @@ class ReturningDrive(TownDrive):
     def __init__(self, seed: int, route: str, lidar: Lidar | None = None) -> None:
         """Build the town; the arguments are those of `TownDrive`, and a name of `ROUTES`."""
         super().__init__(seed, "light", lidar)
-        rows = [row * _COLUMNS + column for row, column in ROUTES[route]]
-        poses = _poses(self.town.streets.nodes[rows])
+        _check(ROUTES[route], self.town.streets)
+        poses = _poses(ROUTES[route], self.town.streets.nodes)
         self._population = self._on_route = _OnRoute(self._population, poses)
         self.frames = len(poses)
 
@@ -75,8 +98,21 @@ class ReturningDrive(TownDrive):
         return parked
 
 
-def _poses(nodes: NDArray[np.float64]) -> list[Transform]:
-    """Return (4, 4) world_T_ego of each frame of a drive past the (N, 2) crossings."""
+def _check(route: Route, streets: Streets) -> None:
+    """Refuse a route where a town has no street."""
+    edges = {frozenset(edge) for edge in streets.edges.tolist()}
+    for (row, column), (last_row, last_column) in pairwise(route.crossings):
+        count = max(abs(last_row - row), abs(last_column - column))
+        down, right = (last_row - row) // count, (last_column - column) // count
+        for k in range(count):
+            one = (row + k * down) * _COLUMNS + column + k * right
+            if frozenset((one, one + down * _COLUMNS + right)) not in edges:
+                raise ValueError(f"this town has no street beyond {divmod(one, _COLUMNS)}")
+
+
+def _poses(route: Route, crossings: NDArray[np.float64]) -> list[Transform]:
+    """Return (4, 4) world_T_ego of each frame of a drive; the crossings of the town are (N, 2)."""
+    nodes = crossings[[row * _COLUMNS + column for row, column in route.crossings]]
     path = [nodes[:1]]
     for before, node, after in zip(nodes[:-2], nodes[1:-1], nodes[2:], strict=True):
         one, other = (_towards(node, end, _CORNER_M) for end in (before, after))
@@ -91,7 +127,8 @@ def _poses(nodes: NDArray[np.float64]) -> list[Transform]:
     bend = np.abs(np.gradient(yaw, _STEP_M))
     yaw = np.convolve(np.pad(yaw, 10, mode="edge"), np.full(21, 1 / 21), mode="valid")
     slow = np.array([bend[max(0, i - 60) : i + 60].max() for i in range(len(bend))])
-    speed = np.minimum(_FAST_M_S, np.sqrt(_SIDEWAYS_M_S2 / np.maximum(slow, 1e-3)))
+    speed = np.minimum(route.fast_m_s, np.sqrt(_SIDEWAYS_M_S2 / np.maximum(slow, 1e-3)))
+    speed = _eased(speed, route.change_m_s2)
     times = np.concatenate([[0.0], np.cumsum(_STEP_M / speed[1:])])
     at = np.arange(0.0, times[-1], FRAME_PERIOD_S)
     x, y, turn = (np.interp(at, times, values) for values in (*lane.T, yaw))
@@ -99,6 +136,14 @@ def _poses(nodes: NDArray[np.float64]) -> list[Transform]:
         translation((*place, 0.0)) @ rotation_z(angle)
         for *place, angle in zip(x.tolist(), y.tolist(), turn.tolist(), strict=True)
     ]
+
+
+def _eased(speed: NDArray[np.float64], change_m_s2: float) -> NDArray[np.float64]:
+    """Return speeds, `_STEP_M` apart, that change no faster."""
+    gain = 2 * change_m_s2 * _STEP_M * np.arange(len(speed))
+    squared = np.minimum.accumulate(speed**2 - gain) + gain
+    squared = (np.minimum.accumulate(squared[::-1] - gain) + gain)[::-1]
+    return np.asarray(np.sqrt(squared))
 
 
 def _towards(
