@@ -6,18 +6,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from carlasc_recorders import TownActor, TownDrive
 from carlasc_recorders.town.actors import Population
+from carlasc_recorders.town.drive import _NOISE, Snapshot, _cast
 from carlasc_recorders.town.streets import HALF_ROAD_M, Streets, right_of
 from numpy.typing import NDArray
 
-from carlasc.captures import Lidar
+from carlasc.captures import Lidar, SensorRecording
 from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.storage.layout import FRAME_PERIOD_S
+
 
 class Route(NamedTuple):
     """Where a drive leads, and how fast.
@@ -33,6 +36,16 @@ class Route(NamedTuple):
     change_m_s2: float = 1e3
 
 
+def _every(crossings: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return also the crossings between others, which are not quite on a line."""
+    made = crossings[:1]
+    for row, column in crossings[1:]:
+        while made[-1] != (row, column):
+            last, other = made[-1]
+            made.append((last + int(np.sign(row - last)), other + int(np.sign(column - other))))
+    return made
+
+
 _ROUND = [(1, 1), (3, 1), (3, 3), (1, 3), (1, 2), (3, 2), (3, 1)]
 _OTHER_WAY = [(1, 1), (1, 3), (3, 3), (3, 2), (1, 2)]
 ROUTES = {
@@ -42,15 +55,17 @@ ROUTES = {
         [(1, 2), (4, 2), (4, 1), (0, 1), (0, 2), (4, 2), (4, 3), (0, 3), (0, 2), (2, 2)]
     ),
     "laps": Route([*[(0, 0), (4, 0), (4, 4), (0, 4)] * 3, (0, 0), (2, 0)]),
-    "small eight": Route([(1, 2), (3, 2), (3, 3), (2, 3), (2, 1), (1, 1), (1, 2), (2, 2)]),
-    "other way": Route([(2, 1), (1, 1), (1, 2), (2, 2), (2, 3), (1, 3), (1, 1), (2, 1)]),
-    "many blocks": Route([*[*_ROUND, *_OTHER_WAY] * 2, (1, 1), (2, 1)], 15.0, 4.0),
+    "small eight": Route(_every([(1, 2), (3, 2), (3, 3), (2, 3), (2, 1), (1, 1), (1, 2), (2, 2)])),
+    "other way": Route(_every([(2, 1), (1, 1), (1, 2), (2, 2), (2, 3), (1, 3), (1, 1), (2, 1)])),
+    "many blocks": Route(_every([*[*_ROUND, *_OTHER_WAY] * 2, (1, 1), (2, 1)]), 15.0, 4.0),
 }
 """Drives of 0.7, 0.8, 1.5, 3.5, 0.7, 0.6 and 3 km."""
 _COLUMNS = 5
 _STEP_M = 0.1  # of the path
 _CORNER_M = 9.0  # from a crossing, where a turn begins
 _SIDEWAYS_M_S2 = 2.5
+_CLEAR_M = (7.0, 2.5)  # between the middles of two vehicles, along and across
+_KEPT_M = 25.0  # driven with one search tree
 
 
 class _OnRoute(Population):
@@ -59,14 +74,29 @@ class _OnRoute(Population):
     def __init__(self, others: Population, poses: Sequence[Transform]) -> None:
         self._others, self._poses = others, poses
         self.gone: Callable[[TownActor, int], bool] = lambda actor, frame: False
+        self._hit = self._in_the_way()
 
     def ego_pose(self, frame: int) -> Transform:
         return self._poses[frame]
 
     def at(self, frame: int) -> list[TownActor]:
         first, *others = self._others.at(frame)
-        others = [actor for actor in others if not self.gone(actor, frame)]
+        others = [
+            actor for actor in others if actor.id not in self._hit and not self.gone(actor, frame)
+        ]
         return [replace(first, world_T_actor=self._poses[frame]), *others]
+
+    def _in_the_way(self) -> set[int]:
+        """Return the numbers of the actors that the vehicle would drive through: inside of one, a
+        scan sees nothing else, and all odometry slips.
+        """
+        hit = set[int]()
+        for frame, pose in enumerate(self._poses):
+            _, *others = self._others.at(frame)
+            places = np.stack([actor.world_T_actor[:2, 3] for actor in others])
+            off = np.abs((places - pose[:2, 3]) @ pose[:2, :2])
+            hit |= {others[row].id for row in np.flatnonzero((off < _CLEAR_M).all(axis=1))}
+        return hit
 
 
 class ReturningDrive(TownDrive):
@@ -83,6 +113,35 @@ class ReturningDrive(TownDrive):
         poses = _poses(ROUTES[route], self.town.streets.nodes)
         self._population = self._on_route = _OnRoute(self._population, poses)
         self.frames = len(poses)
+        self._world: Snapshot | None = None
+
+    def record(self, frame: int, sensor: int = 0) -> SensorRecording:
+        """Return the recording of `TownDrive.record`. The search tree of what stands still serves
+        for some metres.
+        """
+        ego, pose = self.ego_pose(frame), self.sensor_poses(frame, sensor + 1)[sensor]
+        still, others = list[TownActor](), list[TownActor]()
+        for actor in self.actors(frame):
+            (still if actor.id in self._parked else others).append(actor)
+        ids = {actor.id for actor in still}
+        if self._world is not None:
+            away = np.linalg.norm(self._world.world_T_ego[:2, 3] - ego[:2, 3])
+        if self._world is None or away > _KEPT_M or ids != self._world.actors.keys():
+            self._world = self._place(frame, ego, still)
+        moving = self._place(frame, ego, others, with_town=False)
+        bound, rays = self.lidar.noise_m, self.lidar.directions.shape
+        noise = self._random(_NOISE, frame, sensor).uniform(-bound, bound, rays)
+        scan = _cast((self._world, moving), pose, self.lidar, noise)
+        return SensorRecording(scan, pose, np.empty((0, 4)))
+
+    @cached_property
+    def _parked(self) -> set[int]:
+        """Numbers of the actors that are where they began when the drive ends."""
+        first, last = (
+            {actor.id: actor.world_T_actor for actor in self.actors(frame)[1:]}
+            for frame in (0, self.frames - 1)
+        )
+        return {id for id in first.keys() & last if np.array_equal(first[id], last[id])}
 
     def leave_from(self, frame: int) -> list[int]:
         """Let every other parked vehicle be gone from a frame on; return the numbers of all."""
