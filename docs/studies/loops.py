@@ -14,7 +14,7 @@ from unittest.mock import patch
 import numpy as np
 import study
 from numpy.typing import NDArray
-from returning import ReturningDrive
+from returning import ROUTES, ReturningDrive
 
 from carlasc.captures import Lidar
 from carlasc.core.geometry import invert, multiply, small_motions, transform_points
@@ -26,7 +26,15 @@ from carlasc.motion.planes import covariances
 from carlasc.motion.refinement import ThinnedScan, refine_poses
 from carlasc.motion.solving import principal_axes
 
-DRIVES = (("block", 61, 32, 1), ("block", 61, 32, 2), ("there and back", 62, 16, 1))
+DRIVES = (
+    *(
+        (route, seed, 64, every)
+        for route, seed in (("block", 61), ("small eight", 63), ("other way", 62))
+        for every in (4, 2, 1)
+    ),
+    ("many blocks", 62, 32, 2),
+    ("there and back", 62, 16, 1),
+)
 """Route, seed, channels, and every which channel is used."""
 _RAYS = 1000  # per channel
 _BEYOND_M, _NEAR_M = 60.0, 6.0  # driven since a place was seen; away from it
@@ -71,7 +79,7 @@ def record(route: str, seed: int, channels: int, work: Path) -> Recording:
     if not kept.exists():
         lidar = Lidar(channels, channels * _RAYS, *_view(channels))
         drive = ReturningDrive(seed, route, lidar)
-        frames = study.few(range(drive.frames), 12)
+        frames = study.few(range(0, drive.frames, ROUTES[route].every), 12)
         scans = [drive.record(frame).scan for frame in frames]
         np.savez(
             kept,

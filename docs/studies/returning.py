@@ -1,5 +1,5 @@
 """Drives through the simulated town that come back to streets that they have seen, for
-`poses_loops.py`.
+`loops.py` and `parked.py`.
 """
 
 from __future__ import annotations
@@ -29,11 +29,13 @@ class Route(NamedTuple):
         crossings: (row, column) of each crossing at which it begins, turns or ends.
         fast_m_s: speed on straight streets.
         change_m_s2: how fast the speed changes; by default at once.
+        every: which frames a LiDAR scans, at 10 Hz.
     """
 
     crossings: list[tuple[int, int]]
     fast_m_s: float = 10.0
     change_m_s2: float = 1e3
+    every: int = 1
 
 
 def _every(crossings: list[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -57,7 +59,7 @@ ROUTES = {
     "laps": Route([*[(0, 0), (4, 0), (4, 4), (0, 4)] * 3, (0, 0), (2, 0)]),
     "small eight": Route(_every([(1, 2), (3, 2), (3, 3), (2, 3), (2, 1), (1, 1), (1, 2), (2, 2)])),
     "other way": Route(_every([(2, 1), (1, 1), (1, 2), (2, 2), (2, 3), (1, 3), (1, 1), (2, 1)])),
-    "many blocks": Route(_every([*[*_ROUND, *_OTHER_WAY] * 2, (1, 1), (2, 1)]), 15.0, 4.0),
+    "many blocks": Route(_every([*[*_ROUND, *_OTHER_WAY] * 2, (1, 1), (2, 1)]), 15.0, 4.0, 2),
 }
 """Drives of 0.7, 0.8, 1.5, 3.5, 0.7, 0.6 and 3 km."""
 _COLUMNS = 5
