@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers.scenes.walls import close, drifted, drive, level, off_at_end, record, wall
 
+from carlasc.motion import refinement
 from carlasc.motion.refinement import RefinedPoses, ThinnedScan, refine_poses
 
 AROUND = [(10, -2), (80, -2), (80, 42), (-2, 42), (-2, -2), (60, -2)]
@@ -88,7 +89,7 @@ class TestNoLoop:
 
 
 @pytest.mark.slow
-def test_refining_closes_loops_and_leaves_other_drives_as_they_were():
+def test_refining_closes_loops_and_leaves_other_drives_as_they_were(monkeypatch):
     true = drive(AROUND)
     scans, given = record(block(), true), drifted(true)
 
@@ -96,7 +97,11 @@ def test_refining_closes_loops_and_leaves_other_drives_as_they_were():
         thinned = (ThinnedScan.of(scans[row], poses[row]) for row in range(rows))
         return refine_poses(thinned, poses[:rows], **options)
 
-    found = refine(len(true), given, always=True)
+    fits = iter([False])
+    with monkeypatch.context() as patch:  # the first stretch seems not to fit
+        patch.setattr(refinement, "_fit", lambda *_: next(fits, True))
+        found = refine(len(true), given, always=True)
+    assert 0 < found.fits.sum() < len(true)
     assert off_at_end(found.poses, true, 25)[0] < 0.05 and found.refined.all()
     kept, key = RefinedPoses.from_bytes(found.to_bytes("key"), "file")
     assert key == "key" and np.array_equal(kept.loops, found.loops) and len(kept.loops)
