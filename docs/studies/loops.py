@@ -21,6 +21,7 @@ from carlasc.core.geometry import invert, multiply, small_motions, transform_poi
 from carlasc.core.tables import CARLA
 from carlasc.motion import refinement
 from carlasc.motion.joint_alignment import clusters
+from carlasc.motion.loops import close_loops
 from carlasc.motion.odometry import follow_scans, usable_points
 from carlasc.motion.planes import covariances
 from carlasc.motion.refinement import ThinnedScan, refine_poses
@@ -159,7 +160,7 @@ def main() -> None:
             drive = thinned(record(route, seed, channels, given.work), channels, every)
             usable = ((one[usable_points(one)], None) for one in drive.points)
             start = np.stack(list(follow_scans(usable, max_range_m=80.0)))
-            with patch.object(refinement, "close_loops", wraps=refinement.close_loops) as closing:
+            with patch.object(refinement, "close_loops", wraps=close_loops) as closing:
                 made = refine_poses(map(ThinnedScan.of, drive.points, start), start)
             open_at_loops = closing.call_args.args[1] if closing.called else made.poses
             pairs = met_again(drive.true) or [(0, len(start) - 1)]
