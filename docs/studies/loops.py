@@ -28,13 +28,11 @@ from carlasc.motion.refinement import ThinnedScan, refine_poses
 from carlasc.motion.solving import principal_axes
 
 DRIVES = (
-    *(
-        (route, seed, 64, every)
-        for route, seed in (("block", 61), ("small eight", 63), ("other way", 62))
-        for every in (4, 2, 1)
-    ),
+    ("block", 61, 32, 1),
+    ("block", 61, 32, 2),
+    ("small eight", 63, 64, 4),
+    ("other way", 62, 64, 4),
     ("many blocks", 62, 32, 2),
-    ("there and back", 62, 16, 1),
 )
 """Route, seed, channels, and every which channel is used."""
 _RAYS = 1000  # per channel
