@@ -46,6 +46,7 @@ RECENT_S = 0.25  # scans within this time before and after a frame show the scen
 # Points so near to the body of an actor may belong to it, as paths have errors: metres along,
 # across and up.
 _AROUND_M = np.array([0.3, 0.3, 0.1])
+_UNDER_M = np.array([0.0, 0.0, 0.2])  # ground so far below that may be of its wheels or feet
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 _ByClass = dict[int, tuple[Float32Array, Float32Array | None]]  # points and their probabilities
 
@@ -308,6 +309,7 @@ class Merger:
         # of each scan, by its frame; then of its points by class, in its own grid or in others, and
         # of what it saw of each actor
         self._static = dict[int, BoolArray]()
+        self._under = dict[int, BoolArray]()
         self._labels = dict[int, Uint16Array]()
         self._moving = dict[int, Float32Array]()
         self._points = defaultdict[int, dict[bool, _ByClass]](dict)
@@ -315,7 +317,8 @@ class Merger:
 
     def forget_before(self, frame: int) -> None:
         """Clear the caches of scans before a frame."""
-        for kept in (self._static, self._labels, self._moving, self._points, self._carried):
+        by_frame = (self._static, self._under, self._labels, self._moving)
+        for kept in (*by_frame, self._points, self._carried):
             for other in [key for key in kept if key < frame]:
                 del kept[other]
 
@@ -424,7 +427,10 @@ class Merger:
         """
         if frame not in self._static:
             scan = self.scan_of(frame)
-            static = np.ones(len(scan.points), np.bool_)
+            static, under = (
+                np.ones(len(scan.points), np.bool_),
+                np.zeros(len(scan.points), np.bool_),
+            )
             static[scan.moving] = False
             static[self.actors.is_own(scan.points)] = False
             static[self.actors.moving.get(frame, [])] = False
@@ -434,13 +440,21 @@ class Merger:
             for track in self.actors.tracks.values():
                 static[track.members.get(frame, [])] = False
                 lower, upper = track.lower - _AROUND_M, track.upper + _AROUND_M
-                for rays, actor_T_place, crossing in scan.through(track, lower, upper):
+                for rays, actor_T_place, crossing in scan.through(track, lower - _UNDER_M, upper):
                     body = transform_points(actor_T_place, rays.points[crossing])
-                    inside = ((body >= lower) & (body <= upper)).all(axis=1)
+                    inside = ((body >= lower - _UNDER_M) & (body <= upper)).all(axis=1)
                     near = rays.part.start + crossing[inside]
-                    static[near[~ground[near]]] = False
-            self._static[frame] = static
+                    under[near[ground[near]]] = True
+                    static[near[~ground[near] & (body[inside, 2] >= lower[2])]] = False
+            self._static[frame], self._under[frame] = static, static & under
         return self._static[frame]
+
+    def under(self, frame: int) -> BoolArray:
+        """Return (N,) bool: the static points of a scan that are ground in, near or below the body
+        of a moving actor. Some of them are of its wheels or feet.
+        """
+        self.static(frame)
+        return self._under[frame]
 
     def labels(self, frame: int) -> Uint16Array:
         """Return the (N,) classes of the points of a scan.

@@ -14,7 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, IntArray, LabelArray
+from carlasc.core.arrays import (
+    AnyArray,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    LabelArray,
+)
 from carlasc.groundtruth.maps.cloud_files import POINT_DTYPE
 
 Part = tuple[int, int, int]
@@ -22,7 +29,8 @@ Part = tuple[int, int, int]
 tile.
 """
 
-STATIC = -1
+STATIC, UNDER = -1, -2
+"""The groups of static points, and of those that may be of the feet of actors: see `finish`."""
 ROW_DTYPE = np.dtype(
     [
         ("key", "<i8"),
@@ -44,6 +52,8 @@ _STEPS, _VOTE = 1024, 65535
 # least distance of points from the faces of a cell, so that float32 rounding keeps them inside
 _EDGE = 1 / 64
 _MOST_ROWS = 4_000_000  # in memory: 200 MB
+# What is so far above the lowest static point of a column, of this width, is no ground.
+_ABOVE_M, _COLUMN_M = 0.06, 0.25
 
 
 def rows_of_scan(
@@ -59,7 +69,7 @@ def rows_of_scan(
         points: (N, 3) metres, map frame, or the frame of their actor.
         labels: (N,) classes.
         sure: (N,) probability of each class; None: 1.
-        group: `STATIC`, or the number of an actor.
+        group: `STATIC`, `UNDER`, or the number of an actor.
         cell_m: size of a cell, metres.
 
     Returns:
@@ -169,12 +179,33 @@ class GrowingCells:
     def finish(self) -> None:
         """Elect the class of each cell.
 
+        Cells of `UNDER` become static, unless other static ones are clearly below them.
         Afterwards `counts` has the number of points of each part, and `points` yields them.
         """
-        for part in sorted({*self._rows, *self._stored}):
-            points = self._elect(part, self._whole(part, self._rows.pop(part, [])))
+        parts = {*self._rows, *self._stored}
+        for part in sorted({(max(group, STATIC), x, y) for group, x, y in parts}):
+            rows = self._take(part)
+            if part[0] == STATIC:
+                under = self._take((UNDER, *part[1:]))
+                rows = _added([rows, under[self._on_ground(under, rows)]])
+            points = self._elect(part, rows)
             self.counts[part] = len(points)
             self._save(part, points)
+
+    def _take(self, part: Part) -> AnyArray:
+        return self._whole(part, self._rows.pop(part, []) or [np.empty(0, ROW_DTYPE)])
+
+    def _on_ground(self, under: AnyArray, static: AnyArray) -> BoolArray:
+        """Return which rows of a tile are not clearly above the lowest static ones of a column."""
+        wide, lowest = max(round(_COLUMN_M / self.cell_m), 1), np.full(_SIDE**2, np.inf)
+
+        def columns(rows: AnyArray) -> tuple[IntArray, FloatArray]:
+            x, y, z = _indices((STATIC, 0, 0), rows["key"] >> _LABEL_BITS).T
+            return x // wide * _SIDE + y // wide, z + rows["z"] / rows["points"] / _STEPS
+
+        np.minimum.at(lowest, *columns(static))
+        column, height = columns(under)
+        return np.asarray(height <= lowest[column] + _ABOVE_M / self.cell_m)
 
     def _elect(self, part: Part, rows: AnyArray) -> AnyArray:
         """Return one point per cell: the mean of its points, with the class with most votes, the

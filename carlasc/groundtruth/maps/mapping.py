@@ -23,6 +23,7 @@ from carlasc.groundtruth.inputs import GridPlan, choose_frames
 from carlasc.groundtruth.maps.cloud_files import POINT_DTYPE, PointPieces, write_points
 from carlasc.groundtruth.maps.growing_cells import (
     STATIC,
+    UNDER,
     GrowingCells,
     Part,
     cells_of,
@@ -324,8 +325,10 @@ class _AddScans:
             inside = np.isin(keys_of(world), self.gone)
             static = static & ~(inside & ~feed.ground(scan)) if inside.any() else static
         settled = merger.settled(frame).points if self.actors else scan.points
+        under = merger.under(frame)
         chosen: list[tuple[int, AnyArray, FloatArray]] = [
-            (STATIC, np.flatnonzero(static), world[static])
+            (group, np.flatnonzero(own), world[own])
+            for group, own in ((STATIC, static & ~under), (UNDER, static & under))
         ]
         for number, track in merger.actors.tracks.items() if self.actors else ():
             members, pose = track.members.get(frame), track.pose(frame)
