@@ -30,7 +30,7 @@ tile.
 """
 
 STATIC, UNDER = -1, -2
-"""The groups of static points, and of those that may be of the feet of actors: see `finish`."""
+"""The groups of static points, and of ground that may be of an actor: see `finish`."""
 ROW_DTYPE = np.dtype(
     [
         ("key", "<i8"),

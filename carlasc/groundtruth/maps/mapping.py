@@ -317,15 +317,16 @@ class _AddScans:
         actor.
         """
         feed, scan = self.feed, self.feed.read(frame)
-        labels, static = merger.labels(frame), merger.static(frame)
+        labels, static, under = merger.labels(frame), merger.static(frame), merger.under(frame)
         if feed.must_find_ground:  # ground that was found had a class for the votes only
             labels[feed.classes.have_role(labels, "ground")] = feed.classes.geometry_id
         world = transform_points(scan.world_T_sensor, scan.points.astype(np.float64))
         if len(self.gone):
             inside = np.isin(keys_of(world), self.gone)
-            static = static & ~(inside & ~feed.ground(scan)) if inside.any() else static
+            if inside.any():
+                ground = feed.ground(scan)
+                static, under = static & ~(inside & ~ground), under | (inside & ground)
         settled = merger.settled(frame).points if self.actors else scan.points
-        under = merger.under(frame)
         chosen: list[tuple[int, AnyArray, FloatArray]] = [
             (group, np.flatnonzero(own), world[own])
             for group, own in ((STATIC, static & ~under), (UNDER, static & under))
