@@ -14,14 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from carlasc.core.arrays import (
-    AnyArray,
-    BoolArray,
-    Float32Array,
-    FloatArray,
-    IntArray,
-    LabelArray,
-)
+from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, IntArray, LabelArray
 from carlasc.groundtruth.maps.cloud_files import POINT_DTYPE
 
 Part = tuple[int, int, int]
@@ -186,8 +179,7 @@ class GrowingCells:
         for part in sorted({(max(group, STATIC), x, y) for group, x, y in parts}):
             rows = self._take(part)
             if part[0] == STATIC:
-                under = self._take((UNDER, *part[1:]))
-                rows = _added([rows, under[self._on_ground(under, rows)]])
+                rows = _added([rows, self._on_ground(self._take((UNDER, *part[1:])), rows)])
             points = self._elect(part, rows)
             self.counts[part] = len(points)
             self._save(part, points)
@@ -195,8 +187,10 @@ class GrowingCells:
     def _take(self, part: Part) -> AnyArray:
         return self._whole(part, self._rows.pop(part, []) or [np.empty(0, ROW_DTYPE)])
 
-    def _on_ground(self, under: AnyArray, static: AnyArray) -> BoolArray:
-        """Return which rows of a tile are not clearly above the lowest static ones of a column."""
+    def _on_ground(self, under: AnyArray, static: AnyArray) -> AnyArray:
+        """Return the rows of a tile that are not clearly above the lowest static ones of their
+        columns.
+        """
         wide, lowest = max(round(_COLUMN_M / self.cell_m), 1), np.full(_SIDE**2, np.inf)
 
         def columns(rows: AnyArray) -> tuple[IntArray, FloatArray]:
@@ -205,7 +199,7 @@ class GrowingCells:
 
         np.minimum.at(lowest, *columns(static))
         column, height = columns(under)
-        return np.asarray(height <= lowest[column] + _ABOVE_M / self.cell_m)
+        return under[height <= lowest[column] + _ABOVE_M / self.cell_m]
 
     def _elect(self, part: Part, rows: AnyArray) -> AnyArray:
         """Return one point per cell: the mean of its points, with the class with most votes, the

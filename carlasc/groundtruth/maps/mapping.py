@@ -324,8 +324,7 @@ class _AddScans:
         if len(self.gone):
             inside = np.isin(keys_of(world), self.gone)
             if inside.any():
-                ground = feed.ground(scan)
-                static, under = static & ~(inside & ~ground), under | (inside & ground)
+                static, under = static & (feed.ground(scan) | ~inside), under | inside
         settled = merger.settled(frame).points if self.actors else scan.points
         chosen: list[tuple[int, AnyArray, FloatArray]] = [
             (group, np.flatnonzero(own), world[own])
