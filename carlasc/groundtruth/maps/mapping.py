@@ -259,12 +259,12 @@ class DriveMap:
         where, notes, metadata = self.inputs.location, self.inputs.findings(), self.inputs.metadata
         if self.inputs.feed.has_labels:
             notes.append(f"{where}: classes {self.inputs.sequence.table_use()}")
-        if not self.inputs.feed.has_labels:
+            if metadata.predicted:
+                notes.append(f"{where}: classes are those of labels that were {metadata.predicted}")
+        else:
             notes.append(
                 f"{where}: the scans have no labels: the map contains geometry only, in one class"
             )
-        elif metadata.predicted:
-            notes.append(f"{where}: classes are those of labels that were {metadata.predicted}")
         if self.parked:
             notes.append(
                 f"{where}: {count(self.parked, 'parked actor')} that stood there in one pass and "
