@@ -3,8 +3,8 @@ another.
 
 Points near the path that are not ground are looked up in scans of the other passes of the place, as
 in `evidence`. Cells of which one pass saw points, and through which several rays of another pass
-went, are grouped from above. A group counts if it has the size of a vehicle, stands on the ground,
-and holds little that both passes saw: edges of hedges and walls do.
+went, are grouped from above. A group counts if it has the size of a part of a vehicle, stands on
+the ground, and holds little that both passes saw: edges of hedges and walls do.
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ from carlasc.motion.ground import ground_plane
 from carlasc.motion.tracks import LONGEST_M
 
 # Scans that are used are so far apart; another pass is so far away along the drive and in time, and
-# so near in space, sideways and in height.
-_STEP_M, _APART_M, _APART_S, _NEAR_M, _LEVEL_M = 1.0, 60.0, 2 * HORIZON_S, 12.0, 2.0
+# so near in space and in height, as one that ends early sees what is ahead of it, too.
+_STEP_M, _APART_M, _APART_S, _NEAR_M, _LEVEL_M = 1.0, 60.0, 2 * HORIZON_S, 30.0, 2.0
+_AROUND_M = 12.0  # scans of a pass are used that are so much farther away than its nearest one
 _PASSES, _VIEWS = 6, 10  # most passes, and scans of a pass, that a point is looked up in
 _AGREEING, _SURE = 3, 4  # least number of them that saw its place free, also per one that did not
 # Poses of passes may be wrong by so much: what another pass saw beside the place is no free space.
@@ -46,7 +47,7 @@ _REACH_M, _HIGH_M, _LOW_M = 20.0, 4.0, 0.8  # of points: from the sensor, and ab
 _CELL_M = 0.2  # columns are two cells wide
 # Of a group: least number of cells, of columns near the ground, length, height, and shares of what
 # is gone in a column and in all.
-_CELLS, _COLUMNS, _LONG_M, _TALL_M, _IN_COLUMN, _GONE = 15, 3, 2.4, 0.6, 0.5, 0.7
+_CELLS, _COLUMNS, _LONG_M, _TALL_M, _IN_COLUMN, _GONE = 30, 3, 1.2, 0.6, 0.5, 0.7
 
 View = tuple[Transform, Sequence[SortedReturns]]
 """A pose, (4, 4) world_T_sensor, and the returns of its sensors."""
@@ -69,13 +70,14 @@ def other_passes(positions: FloatArray, seconds: FloatArray) -> dict[int, list[I
     used = np.unique(np.floor(along / _STEP_M), return_index=True)[1]
     found = dict[int, list[IntArray]]()
     for row in used.tolist():
-        off = np.abs(positions[used] - positions[row])
-        near = (np.hypot(off[:, 0], off[:, 1]) < _NEAR_M) & (off[:, 2] < _LEVEL_M)
+        off = np.abs(positions - positions[row])
+        away = np.hypot(off[:, 0], off[:, 1])
+        near = (away[used] < _NEAR_M) & (off[used, 2] < _LEVEL_M)
         near &= np.abs(along[used] - along[row]) > _APART_M
         rows = used[near & (np.abs(seconds[used] - seconds[row]) > _APART_S)]
         if len(rows):
-            ends = np.flatnonzero(np.diff(along[rows]) > 2 * _NEAR_M) + 1
-            passes = np.split(rows, ends)
+            ends = np.flatnonzero(np.diff(along[rows]) > 2 * _AROUND_M) + 1
+            passes = [own[away[own] < away[own].min() + _AROUND_M] for own in np.split(rows, ends)]
             found[row] = [
                 passes[number][spread_rows(len(passes[number]), _VIEWS)]
                 for number in spread_rows(len(passes), _PASSES)

@@ -11,6 +11,7 @@ from carlasc.errors import StorageError
 from carlasc.groundtruth.maps.growing_cells import (
     ROW_DTYPE,
     STATIC,
+    UNDER,
     GrowingCells,
     cells_of,
     rows_of_scan,
@@ -46,6 +47,21 @@ def test_memory_is_bounded_and_changes_nothing(tmp_path):
     assert_array_equal(few, whole)
     backwards, _ = filled(tmp_path / "c", reversed(list(scans(60))), 1000)
     assert_array_equal(backwards, whole)
+
+
+@pytest.mark.parametrize("most_rows", [10**9, 1])
+def test_ground_below_an_actor_is_kept_only_at_the_height_of_the_road(tmp_path, most_rows):
+    road = np.array([[x, 0.11, 0.01] for x in (0.01, 0.31, 0.61)])
+    asked = np.array([[0.12, 0.02, 0.03], [0.12, 0.02, 0.12], [0.37, 0.2, 0.08], [30, 7, 0.12]])
+    cells = GrowingCells(tmp_path, CELL_M, most_rows)
+    for group, points in ((UNDER, asked), (STATIC, road)):
+        labels = np.ones(len(points), np.uint16)
+        cells.add(split(*rows_of_scan(points, labels, None, group, CELL_M)))
+    cells.finish()
+    made = cells_of(np.concatenate(list(cells.points())), CELL_M).tolist()
+    # what is 0.07 and 0.11 m above the road is a foot; where no road was seen, nobody knows
+    expected = np.floor(np.concatenate([road, asked[[0, 3]]]) / CELL_M).astype(int).tolist()
+    assert sorted(made) == sorted(expected)
 
 
 def test_each_cell_has_one_point_inside_it_wherever_it_is(tmp_path):

@@ -264,10 +264,11 @@ def test_wrong_arguments_are_refused_before_anything_is_written(drive, tmp_path,
         make(drive, out, frames="99:")
     assert error.value.expected.startswith("frames in 99:")
     with pytest.raises(MissingDataError) as error:
-        monkeypatch.setattr(
-            "carlasc.groundtruth.from_scans.merging.Merger.static",
-            lambda self, frame: np.zeros(len(self.scan_of(frame).points), bool),
-        )
+        for name in ("static", "under"):
+            monkeypatch.setattr(
+                f"carlasc.groundtruth.from_scans.merging.Merger.{name}",
+                lambda self, frame: np.zeros(len(self.scan_of(frame).points), bool),
+            )
         make(drive, out, frames="0:2")
     assert error.value.expected == "points of something static"
     assert list(tmp_path.iterdir()) == []

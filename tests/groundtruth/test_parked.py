@@ -125,10 +125,21 @@ def test_passes_are_far_in_time_and_along_the_drive_and_near_in_space():
     row = 5
     (rows,) = found[row]
     assert 0 < len(rows) <= 10
-    assert np.linalg.norm(places[rows] - places[row], axis=1).max() < 12.0
+    away = np.linalg.norm(places[rows] - places[row], axis=1)
+    assert away.max() < away.min() + 12.0
     assert (rows > len(places) // 2).all()
     assert not other_passes(places[: len(places) // 2], np.arange(len(places) // 2) * FRAME_S)
     assert not other_passes(places, np.zeros(len(places)))
+
+
+def test_a_pass_that_ends_early_is_compared_with_what_is_ahead_of_it():
+    along = np.r_[np.arange(0.0, 100), np.arange(100.0, 200), np.arange(200.0, 130, -1)]
+    places = np.column_stack([along, np.zeros_like(along), np.zeros_like(along)])
+    found = other_passes(places, np.arange(len(places)) * 1.0)
+    (rows,) = found[110]  # 21 m from the end of the way back
+    assert (rows > 200).all()
+    assert places[rows, 0].min() == 131.0
+    assert 90 not in found  # too far away
 
 
 def test_a_street_that_is_driven_often_is_compared_with_a_few_of_its_passes():

@@ -46,6 +46,7 @@ RECENT_S = 0.25  # scans within this time before and after a frame show the scen
 # Points so near to the body of an actor may belong to it, as paths have errors: metres along,
 # across and up.
 _AROUND_M = np.array([0.3, 0.3, 0.1])
+_UNDER_M = np.array([0.0, 0.0, 0.2])  # ground so far below that may be of its wheels or feet
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 _ByClass = dict[int, tuple[Float32Array, Float32Array | None]]  # points and their probabilities
 
@@ -307,7 +308,7 @@ class Merger:
         self.scan_of, self.actors, self.classes, self.dynamic = scan_of, actors, classes, dynamic
         # of each scan, by its frame; then of its points by class, in its own grid or in others, and
         # of what it saw of each actor
-        self._static = dict[int, BoolArray]()
+        self._static = dict[int, tuple[BoolArray, BoolArray]]()
         self._labels = dict[int, Uint16Array]()
         self._moving = dict[int, Float32Array]()
         self._points = defaultdict[int, dict[bool, _ByClass]](dict)
@@ -424,23 +425,33 @@ class Merger:
         """
         if frame not in self._static:
             scan = self.scan_of(frame)
-            static = np.ones(len(scan.points), np.bool_)
+            under = np.zeros(len(scan.points), np.bool_)
+            static = ~under
             static[scan.moving] = False
             static[self.actors.is_own(scan.points)] = False
             static[self.actors.moving.get(frame, [])] = False
             # Wheels touch the ground: ground near a body stays static, or each actor would leave a
-            # hole in the road.
+            # hole in the road. A map knows the road of other scans: see `under`.
             ground = self.classes.have_role(scan.labels, "ground")
             for track in self.actors.tracks.values():
                 static[track.members.get(frame, [])] = False
                 lower, upper = track.lower - _AROUND_M, track.upper + _AROUND_M
-                for rays, actor_T_place, crossing in scan.through(track, lower, upper):
+                least = lower - _UNDER_M
+                for rays, actor_T_place, crossing in scan.through(track, least, upper):
                     body = transform_points(actor_T_place, rays.points[crossing])
-                    inside = ((body >= lower) & (body <= upper)).all(axis=1)
+                    inside = ((body >= least) & (body <= upper)).all(axis=1)
                     near = rays.part.start + crossing[inside]
-                    static[near[~ground[near]]] = False
-            self._static[frame] = static
-        return self._static[frame]
+                    under[near[ground[near]]] = True
+                    static[near[~ground[near] & (body[inside, 2] >= lower[2])]] = False
+            self._static[frame] = static, under
+        return self._static[frame][0]
+
+    def under(self, frame: int) -> BoolArray:
+        """Return (N,) bool: the points of a scan on ground in, near or below the body of a moving
+        actor. Some of them are of its wheels or feet.
+        """
+        self.static(frame)
+        return self._static[frame][1]
 
     def labels(self, frame: int) -> Uint16Array:
         """Return the (N,) classes of the points of a scan.

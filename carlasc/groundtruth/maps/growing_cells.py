@@ -22,7 +22,8 @@ Part = tuple[int, int, int]
 tile.
 """
 
-STATIC = -1
+STATIC, UNDER = -1, -2
+"""The groups of static points, and of ground that may be of an actor: see `finish`."""
 ROW_DTYPE = np.dtype(
     [
         ("key", "<i8"),
@@ -45,6 +46,8 @@ _STEPS, _VOTE = 1024, 65535
 _EDGE = 1 / 64
 _MOST_ROWS = 1_000_000  # in memory: 48 MB
 _REPEATED = 2  # rows of a part on disk, over those that are left when they are summed
+# What is so far above the lowest static point of a column, of this width, is no ground.
+_ABOVE_M, _COLUMN_M = 0.06, 0.25
 
 
 def rows_of_scan(
@@ -60,7 +63,7 @@ def rows_of_scan(
         points: (N, 3) metres, map frame, or the frame of their actor.
         labels: (N,) classes.
         sure: (N,) probability of each class; None: 1.
-        group: `STATIC`, or the number of an actor.
+        group: `STATIC`, `UNDER`, or the number of an actor.
         cell_m: size of a cell, metres.
 
     Returns:
@@ -179,12 +182,34 @@ class GrowingCells:
     def finish(self) -> None:
         """Elect the class of each cell.
 
+        Cells of `UNDER` become static, unless other static ones are clearly below them.
         Afterwards `counts` has the number of points of each part, and `points` yields them.
         """
-        for part in sorted({*self._rows, *self._stored}):
-            points = self._elect(part, self._whole(part, self._rows.pop(part, [])))
+        parts = {*self._rows, *self._stored}
+        for part in sorted({(max(group, STATIC), x, y) for group, x, y in parts}):
+            rows = self._take(part)
+            if part[0] == STATIC:
+                rows = _added([rows, self._on_ground(self._take((UNDER, *part[1:])), rows)])
+            points = self._elect(part, rows)
             self.counts[part] = len(points)
             points.tofile(self._path(part))
+
+    def _take(self, part: Part) -> AnyArray:
+        return self._whole(part, self._rows.pop(part, []) or [np.empty(0, ROW_DTYPE)])
+
+    def _on_ground(self, under: AnyArray, static: AnyArray) -> AnyArray:
+        """Return the rows of a tile that are not clearly above the lowest static ones of their
+        columns.
+        """
+        wide, lowest = max(round(_COLUMN_M / self.cell_m), 1), np.full(_SIDE**2, np.inf)
+
+        def columns(rows: AnyArray) -> tuple[IntArray, FloatArray]:
+            x, y, z = _indices((STATIC, 0, 0), rows["key"] >> _LABEL_BITS).T
+            return x // wide * _SIDE + y // wide, z + rows["z"] / rows["points"] / _STEPS
+
+        np.minimum.at(lowest, *columns(static))
+        column, height = columns(under)
+        return under[height <= lowest[column] + _ABOVE_M / self.cell_m]
 
     def _elect(self, part: Part, rows: AnyArray) -> AnyArray:
         """Return one point per cell: the mean of its points, with the class with most votes, the

@@ -23,6 +23,7 @@ from carlasc.groundtruth.inputs import GridPlan, choose_frames
 from carlasc.groundtruth.maps.cloud_files import POINT_DTYPE, PointPieces, write_points
 from carlasc.groundtruth.maps.growing_cells import (
     STATIC,
+    UNDER,
     GrowingCells,
     Part,
     cells_of,
@@ -254,12 +255,12 @@ class DriveMap:
         where, notes, metadata = self.inputs.location, self.inputs.findings(), self.inputs.metadata
         if self.inputs.feed.has_labels:
             notes.append(f"{where}: classes {self.inputs.sequence.table_use()}")
-        if not self.inputs.feed.has_labels:
+            if metadata.predicted:
+                notes.append(f"{where}: classes are those of labels that were {metadata.predicted}")
+        else:
             notes.append(
                 f"{where}: the scans have no labels: the map contains geometry only, in one class"
             )
-        elif metadata.predicted:
-            notes.append(f"{where}: classes are those of labels that were {metadata.predicted}")
         if self.parked:
             notes.append(
                 f"{where}: {count(self.parked, 'parked actor')} that stood there in one pass and "
@@ -312,16 +313,18 @@ class _AddScans:
         actor.
         """
         feed, scan = self.feed, self.feed.read(frame)
-        labels, static = merger.labels(frame), merger.static(frame)
+        labels, static, under = merger.labels(frame), merger.static(frame), merger.under(frame)
         if feed.must_find_ground:  # ground that was found had a class for the votes only
             labels[feed.classes.have_role(labels, "ground")] = feed.classes.geometry_id
         world = transform_points(scan.world_T_sensor, scan.points.astype(np.float64))
         if len(self.gone):
             inside = np.isin(keys_of(world), self.gone)
-            static = static & ~(inside & ~feed.ground(scan)) if inside.any() else static
+            if inside.any():
+                static, under = static & (feed.ground(scan) | ~inside), under | inside
         settled = merger.settled(frame).points if self.actors else scan.points
         chosen: list[tuple[int, AnyArray, FloatArray]] = [
-            (STATIC, np.flatnonzero(static), world[static])
+            (group, np.flatnonzero(own), world[own])
+            for group, own in ((STATIC, static & ~under), (UNDER, static & under))
         ]
         for number, track in merger.actors.tracks.items() if self.actors else ():
             members, pose = track.members.get(frame), track.pose(frame)
