@@ -27,7 +27,7 @@ from carlasc.motion.evidence import (
     FreeSpaceEvidence,
     cells_around,
 )
-from carlasc.motion.paths import Segment, estimate_path, is_static, middles_of, misalignment
+from carlasc.motion.paths import Path, Segment, is_static, middles_of, misalignment, path_of
 from carlasc.motion.planes import nearest_points
 from carlasc.motion.solving import best_pairs
 
@@ -70,7 +70,7 @@ _OWN_SHARE = 0.5  # an actor with so many points in these cells is none
 # it, and whose velocities differ by so much. So many points of their last ones stand for them.
 _KNOWN, _NEAR_M, _APART_M_S, _MODEL = 3, 0.2, 1.0, 80
 _KEPT = 400  # points of an observation that are kept
-_SAMPLES = 300  # points of an observation that its path is estimated from
+_SAMPLES = 300  # points of an observation that are compared with those of another
 
 
 @dataclass(frozen=True)
@@ -82,11 +82,13 @@ class FoundActor:
             `instance` is its number.
         rigid: whether it keeps its shape, as vehicles do.
         confidence: probability that it is real, from 0 to 1: see `_confidence`.
+        path: the result of `estimate_path`.
     """
 
     segments: tuple[Segment, ...]
     rigid: bool
     confidence: float
+    path: Path
 
 
 class ActorFollower:
@@ -364,13 +366,9 @@ class _ActorChain:
         label = int(votes.argmax()) or default_label
         sizes = np.quantile([link.upper - link.lower for link in self.links], 0.8, axis=0)
         rigid = label not in deformable if votes.argmax() and deformable else not _is_small(sizes)
-        thinned = [segment.thinned(_SAMPLES) for segment in segments]
-        samples = [segment.points for segment in thinned]
-        delays = [s.times for s in thinned] if thinned[0].times is not None else None
-        positions, velocities, headings = estimate_path(
-            samples, seconds, rigid=rigid, delays=delays
-        )
-        samples = [few.at_frame(v).points for few, v in zip(thinned, velocities, strict=True)]
+        path = positions, velocities, headings = path_of(segments, seconds, rigid=rigid)
+        segments = [s.at_frame(v) for s, v in zip(segments, velocities, strict=True)]
+        samples = [segment.points for segment in segments]
         speeds = np.linalg.norm(velocities[:, :2], axis=1)
         if (
             np.ptp(positions[:, :2], axis=0).max() < _MIN_PATH_M
@@ -390,10 +388,10 @@ class _ActorChain:
         if confidence < _LEAST_CONFIDENCE:
             return None
         parts = [
-            replace(segment.at_frame(velocity), label=label, velocity=velocity, instance=instance)
+            replace(segment, label=label, velocity=velocity, instance=instance)
             for segment, velocity in zip(segments, velocities, strict=True)
         ]
-        return FoundActor(tuple(parts), rigid, confidence)
+        return FoundActor(tuple(parts), rigid, confidence, path)
 
     def _confidence(
         self,

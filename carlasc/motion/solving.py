@@ -201,6 +201,7 @@ def smooth(
     return smoothed, slopes
 
 
+@cached(error_model="python")
 def smooth_at(
     index: int,
     values: FloatArray,
@@ -212,23 +213,35 @@ def smooth_at(
     distance = np.abs(seconds - seconds[index])
     near = np.flatnonzero(distance <= half_s + 1e-9)
     if len(near) < 4:
-        near = np.sort(np.argsort(distance, kind="stable")[:4])
-    offsets = seconds[near] - seconds[index]
+        near = np.sort(np.argsort(distance, kind="mergesort")[:4])
+    offsets, wide = seconds[near] - seconds[index], values.shape[1]
     degree = 2 if len(near) > 5 else 1 if len(near) > 1 else 0
-    design, own = offsets[:, None] ** np.arange(degree + 1), values[near]
-    weight = weights[near] * (1 - 0.9 * (np.abs(offsets) / max(np.abs(offsets).max(), 1e-9)) ** 3)
+    rows, own = np.ones((len(near), degree + 1)), np.empty((len(near), wide))
+    scaled, aimed, weight = np.empty_like(rows), np.empty_like(own), weights[near]
+    farthest = max(np.abs(offsets).max(), 1e-9)
+    for i in range(len(near)):
+        own[i] = values[near[i]]
+        for k in range(degree):
+            rows[i, k + 1] = rows[i, k] * offsets[i]
+        weight[i] *= 1 - 0.9 * (abs(offsets[i]) / farthest) ** 3
+    fit, error = np.empty((degree + 1, wide)), np.empty(len(near))
     for _ in range(3):  # reweighted, so that partly hidden actors do not bend the path
-        root = np.sqrt(weight)[:, None]
-        fit = least_squares(design * root, own * root)
-        error = np.linalg.norm(own - multiply(design, fit), axis=1)
-        weight = weight / (1 + (error / max(3 * _median(error), 0.02)) ** 2)
-    return fit[0], fit[1] if degree else np.zeros_like(fit[0])
-
-
-def _median(values: FloatArray) -> float:
-    """Return the median of (N,) values, N > 0; for few, `np.median` takes five times as long."""
-    ranked, half = np.sort(values), len(values) // 2
-    return float(ranked[half]) if len(values) % 2 else float((ranked[half - 1] + ranked[half]) / 2)
+        for i in range(len(near)):
+            root = np.sqrt(weight[i])
+            scaled[i], aimed[i] = rows[i] * root, own[i] * root
+        fit = least_squares(scaled, aimed)
+        for i in range(len(near)):
+            squared = 0.0
+            for d in range(wide):
+                left = own[i, d]
+                for k in range(degree + 1):
+                    left -= rows[i, k] * fit[k, d]
+                squared += left * left
+            error[i] = np.sqrt(squared)
+        usual = max(3 * np.median(error), 0.02)
+        for i in range(len(near)):
+            weight[i] /= 1 + (error[i] / usual) ** 2
+    return fit[0], fit[1] if degree else np.zeros(wide)
 
 
 def resample(

@@ -38,6 +38,7 @@ from carlasc.motion import (
 from carlasc.motion.bodies import surface_of
 from carlasc.motion.boxes import register_boxes
 from carlasc.motion.found_actors import FoundActor
+from carlasc.motion.paths import Path
 from carlasc.motion.refinement import RefinedPoses, ThinnedScan, refine_poses
 from carlasc.motion.tracks import FIRST_FOUND, MovingActors, with_surfaces
 from carlasc.running.processes import run_all
@@ -61,8 +62,10 @@ _ACTORS = 32  # number of actors whose tracks are estimated together
 _SHAPE_POINTS = 128  # number of points of a boxed object in a scan, for its shape and its motion
 _BLOCK = 50, 200  # least and greatest number of frames whose evidence is found in one piece
 
-_Observed = tuple[Chain, bool | None, float]
-"""The segments of an actor, whether it is rigid (None: its class decides), and its confidence."""
+_Observed = tuple[Chain, bool | None, float, Path | None]
+"""The segments of an actor, whether it is rigid (None: its class decides), its confidence, and its
+path (None: it is not known).
+"""
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -91,8 +94,10 @@ def _find_evidence(*args: Any, **options: Any) -> list[FreeSpaceEvidence]:
 
 def _make_track(actor: _Observed, times: dict[int, float], deformable: frozenset[int]) -> Track:
     """Estimate the track of one actor, in a worker."""
-    chain, rigid, confidence = actor
-    return make_track(chain, times, deformable=deformable, rigid=rigid, confidence=confidence)
+    chain, rigid, sure, path = actor
+    return make_track(
+        chain, times, deformable=deformable, rigid=rigid, confidence=sure, path=path
+    )
 
 
 def _follow_box(boxed: tuple[Track, list[Segment]], times: dict[int, float]) -> Track:
@@ -102,8 +107,7 @@ def _follow_box(boxed: tuple[Track, list[Segment]], times: dict[int, float]) -> 
 
 
 def _observed(actor: FoundActor) -> _Observed:
-    # its path is estimated again: integrated velocities would drift
-    return [replace(s, velocity=None) for s in actor.segments], actor.rigid, actor.confidence
+    return list(actor.segments), actor.rigid, actor.confidence, actor.path
 
 
 def _each(
@@ -182,7 +186,7 @@ def _linked(feed: ScanFeed, run: Run, steps: Callable[[int], None]) -> list[Trac
                 steps(1)
         if begin + _BATCH >= len(frames):
             ended += linker.finish()
-        tracks += _estimate(feed, run, [(linked, None, 1.0) for linked in ended])
+        tracks += _estimate(feed, run, [(linked, None, 1.0, None) for linked in ended])
     return tracks
 
 
