@@ -141,13 +141,16 @@ class ActorFollower:
         if np.isfinite(scan.ground_m):
             self._grounds.append(scan.ground_m)
         self._near[scan.near] += 1
-        sensor_T_world = invert(scan.world_T_sensor)
-        for members, points in zip(scan.clusters, scan.points, strict=True):
-            local = transform_points(sensor_T_world, points)
-            cells = cells_around(local)
-            self._freed[cells] += 1
-            if len(cells) and np.abs(local).max() < OWN_REACH_M:
-                self._close.append((scan.frame, members, cells))
+        points = np.concatenate([np.empty((0, 3)), *scan.points])
+        local = transform_points(invert(scan.world_T_sensor), points)
+        inside = (np.abs(local) < OWN_REACH_M).all(axis=1)
+        ends = np.cumsum([0, *map(len, scan.points)])
+        for members, one, end in zip(scan.clusters, ends, ends[1:], strict=False):
+            if inside[one:end].any():
+                cells = cells_around(local[one:end])
+                self._freed[cells] += 1
+                if inside[one:end].all():
+                    self._close.append((scan.frame, members, cells))
         before, self._alive = self._alive, []
         ended = list[_ActorChain]()
         for one in before:
@@ -329,7 +332,8 @@ class _ActorChain:
         # The visible faces change: the velocities of the lower corner, the middle and the upper
         # corner are compared, and the lowest one counts.
         offsets = seconds - seconds.mean()
-        corners = np.stack([[link.lower, link.middle, link.upper] for link in recent])
+        lower, upper = np.array([(link.lower, link.upper) for link in recent]).swapaxes(0, 1)
+        corners = np.stack([lower, (lower + upper) / 2, upper], axis=1)
         slopes = (offsets[:, None, None] * corners).sum(axis=0) / np.square(offsets).sum()
         least = np.take_along_axis(slopes, np.abs(slopes).argmin(axis=0)[None], axis=0)[0]
         return np.where(np.abs(slopes).max(axis=0) > 0, (least + slopes[1]) / 2, 0.0)
@@ -345,12 +349,6 @@ class _ActorChain:
             return True
         assert self.velocity is not None and other.velocity is not None
         return float(np.hypot(*(self.velocity - other.velocity)[:2])) > _APART_M_S
-
-    def covers(self, link: _Link) -> bool:
-        """Return whether an observation is inside the place that is expected of the next one."""
-        shift = self.shift(link.seconds)
-        lower, upper = self.last.lower + shift - 0.3, self.last.upper + shift + 0.3
-        return bool(((link.middle > lower) & (link.middle < upper))[:2].all())
 
     def actor(
         self, deformable: Collection[int], instance: int, default_label: int
@@ -565,16 +563,19 @@ def _link(
     clusters = [_Link.of(evidence, index) for index in range(len(evidence.clusters))]
     apart = [part.thinned(_KEPT) for part in _split(clusters, alive)]
     links = _join_parts(apart, deformable)
-    taken = best_pairs(_costs(links, alive) if alive else [])
-    extra = {
-        i: j
-        for i in range(len(links))
-        if i not in taken
-        for j in set(taken.values())
-        if alive[j].last.label == links[i].label
-        and not _is_rider(links[i], deformable)
-        and alive[j].covers(links[i])
-    }
+    taken = best_pairs(_costs(links, alive) if alive and links else [])
+    chosen = list(set(taken.values()))
+    # where the chains are expected
+    moved = np.array([alive[j].shift(evidence.seconds) for j in chosen]).reshape(-1, 3)
+    ends = np.array([(alive[j].last.lower, alive[j].last.upper) for j in chosen])
+    lower, upper = ends.reshape(-1, 2, 3).swapaxes(0, 1) + moved
+    extra = dict[int, int]()
+    for i, link in enumerate(links):
+        if i not in taken and not _is_rider(link, deformable):
+            covers = (link.middle > lower - 0.3) & (link.middle < upper + 0.3)
+            for k in np.flatnonzero(covers[:, :2].all(axis=1)).tolist():
+                if alive[chosen[k]].last.label == link.label:
+                    extra[i] = chosen[k]
     for i, j in extra.items():
         main = next(k for k, chain in taken.items() if chain == j)
         links[main] = links[main].joined(links[i])
@@ -597,18 +598,20 @@ def _costs(links: list[_Link], alive: list[_ActorChain]) -> list[tuple[float, in
     velocity = np.stack(
         [np.zeros(3) if chain.velocity is None else chain.velocity for chain in alive]
     )
-    costs = list[tuple[float, int, int]]()
-    for i, link in enumerate(links):
-        elapsed = link.seconds - seconds
-        shift = velocity * elapsed[:, None]
-        gap = np.maximum(np.maximum(lower + shift - link.upper, link.lower - upper - shift), 0.0)
-        offset = link.middle - middle - shift
-        reach = _REACH_M + np.where(fresh, np.minimum(_MAX_SPEED_M_S * elapsed, 4.0), 0.0)
-        aside = np.linalg.norm(offset[:, :2], axis=1)
-        can = (label == link.segment.label) & (np.abs(middle - link.middle).max(axis=1) < _FAR_M)
-        can &= (np.linalg.norm(gap[:, :2], axis=1) <= reach) & (gap[:, 2] <= _REACH_M)
-        can &= aside <= 3 * reach + 2.0
-        sizes = np.abs((link.upper - link.lower) - size).sum(axis=1)
-        cost = np.linalg.norm(gap, axis=1) + 0.3 * aside + 0.2 * sizes
-        costs += [(float(cost[j]), i, j) for j in np.flatnonzero(can).tolist()]
-    return costs
+    # (L, A, 3): of each observation and each chain
+    low, high, at = (
+        np.stack([getattr(link, name) for link in links])[:, None]
+        for name in ("lower", "upper", "middle")
+    )
+    elapsed = links[0].seconds - seconds
+    shift = velocity * elapsed[:, None]
+    gap = np.maximum(np.maximum(lower + shift - high, low - upper - shift), 0.0)
+    reach = _REACH_M + np.where(fresh, np.minimum(_MAX_SPEED_M_S * elapsed, 4.0), 0.0)
+    aside = np.linalg.norm((at - middle - shift)[..., :2], axis=-1)
+    can = label == np.array([link.label for link in links])[:, None]
+    can &= np.abs(middle - at).max(axis=-1) < _FAR_M
+    can &= (np.linalg.norm(gap[..., :2], axis=-1) <= reach) & (gap[..., 2] <= _REACH_M)
+    can &= aside <= 3 * reach + 2.0
+    sizes = np.abs((high - low) - size).sum(axis=-1)
+    cost = np.linalg.norm(gap, axis=-1) + 0.3 * aside + 0.2 * sizes
+    return [(float(cost[i, j]), i, j) for i, j in np.argwhere(can).tolist()]
