@@ -57,14 +57,15 @@ _LEAST_CONFIDENCE = 0.5  # of an actor
 _STAYS_M, _SENSOR_PATH_M = 0.5, 1.0  # points that move with the sensor, while it drives so far
 _LINE_SLOPE = 0.004  # a quarter of a degree: the points of one scan line differ by less
 # Parts of the recording vehicle: cells around the sensor in which nearly all scans have points,
-# often at places that were free at other times; and cells beside them with such points. Deskewing
-# moves such parts by decimetres whenever the speed changes, so that they do not look rigid: they
-# cannot be told from a person who walks beside the sensor at exactly its pace.
+# often at places that were free at other times; and cells beside them with such points.
 _ALWAYS, _FREED, _OFTEN = 0.95, 0.3, 0.3
 _BESIDE_M = 1.8  # farther beside the way of the sensor, another vehicle may drive along
 # What stands on the ground beside the sensor is a rider or a person, who keeps its pace: so near
-# above the ground, and so high and not longer.
+# above the ground, and so high and not longer. So is what is so high and shifts by so much beside
+# the sensor: the median. A delay of at most so long, as of deskewing, moves parts as the speed
+# changes.
 _FOOT_M, _STANDS_M, _STRETCH_M = 0.6, 1.0, 2.6
+_HIGH_M, _SHIFTS_M, _DELAY_S = 0.5, 0.04, 0.1
 _OWN_SHARE = 0.5  # an actor with so many points in these cells is none
 # A cluster is split between chains of so many observations, whose middles are expected so near to
 # it, and whose velocities differ by so much. So many points of their last ones stand for them.
@@ -125,6 +126,7 @@ class ActorFollower:
         # in how many scans each cell has points, and in how many clusters
         self._near, self._freed = np.zeros((2, OWN_CELLS**3), np.int64)
         self._cells: dict[int, list[IntArray]] = {}
+        self._shifting: list[int] = []
         self._poses: list[Transform] = []
         self._grounds: list[float] = []
         self._close: list[tuple[int, IntArray, IntArray]] = []
@@ -164,6 +166,8 @@ class ActorFollower:
         """Return the actors that have not ended, and find the parts of the recording vehicle."""
         actors = self._actors(self._alive)
         own = self._own_cells()
+        for number in self._shifting:
+            own.flat[np.concatenate(self._cells[number])] = False
         for number, seen in self._cells.items():
             elsewhere = sum(not len(cells) for cells in seen)
             inside = own.ravel()[np.concatenate(seen)]
@@ -220,6 +224,7 @@ class ActorFollower:
             if actor := one.actor(self._deformable, self._number, self._label):
                 actors.append(actor)
                 self._cells[self._number] = one.cells()
+                self._shifting += [self._number] if one.shifts() else []
                 self._number += 1
         return actors
 
@@ -439,10 +444,7 @@ class _ActorChain:
         in place there while the sensor moves.
         """
         driven = np.ptp([link.world_T_sensor[:3, 3] for link in self.links], axis=0).max()
-        local = [
-            transform_points(invert(link.world_T_sensor), link.segment.points)
-            for link in self.links
-        ]
+        local = self._local()
         middles = middles_of(local)
         stays = np.median(np.abs(middles - np.median(middles, axis=0)), axis=0).max() < _STAYS_M
         return (
@@ -451,8 +453,27 @@ class _ActorChain:
 
     def cells(self) -> list[IntArray]:
         """Return the cells around the sensor in which each observation has points."""
+        return [cells_around(points) for points in self._local()]
+
+    def shifts(self) -> bool:
+        """Return whether it is high and does not stay in place in the sensor frame, as all parts of
+        the recording vehicle do.
+        """
+        poses = np.stack([link.world_T_sensor for link in self.links])
+        seconds = np.array([link.seconds for link in self.links])
+        speed = np.gradient(poses[:, :3, 3], seconds, axis=0)
+        speed = multiply(invert(poses)[:, :3, :3], speed[..., None])[:, :2, 0]
+        middles = middles_of(self._local())[:, :2]
+        change = speed - speed.mean(axis=0)
+        delay = (middles * change).sum() / max(np.square(change).sum(), 1e-3)
+        left = middles - np.clip(delay, -_DELAY_S, _DELAY_S) * speed
+        apart = np.median(np.abs(left - np.median(left, axis=0)), axis=0)
+        high = np.median([link.upper[2] - link.lower[2] for link in self.links])
+        return bool(np.hypot(*apart) > _SHIFTS_M and high > _HIGH_M)
+
+    def _local(self) -> list[FloatArray]:
         return [
-            cells_around(transform_points(invert(link.world_T_sensor), link.segment.points))
+            transform_points(invert(link.world_T_sensor), link.segment.points)
             for link in self.links
         ]
 
