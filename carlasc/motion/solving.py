@@ -10,7 +10,6 @@ import numpy as np
 
 from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.compiling import cached
-from carlasc.core.geometry import multiply
 
 _HEADING_SPEED_M_S = 1.0  # above it, the heading is the direction of motion
 _SWEEPS = 12  # greatest number for Jacobi's method, which takes about five

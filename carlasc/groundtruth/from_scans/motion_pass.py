@@ -95,9 +95,7 @@ def _find_evidence(*args: Any, **options: Any) -> list[FreeSpaceEvidence]:
 def _make_track(actor: _Observed, times: dict[int, float], deformable: frozenset[int]) -> Track:
     """Estimate the track of one actor, in a worker."""
     chain, rigid, sure, path = actor
-    return make_track(
-        chain, times, deformable=deformable, rigid=rigid, confidence=sure, path=path
-    )
+    return make_track(chain, times, deformable=deformable, rigid=rigid, confidence=sure, path=path)
 
 
 def _follow_box(boxed: tuple[Track, list[Segment]], times: dict[int, float]) -> Track:
