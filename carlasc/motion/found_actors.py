@@ -5,8 +5,9 @@ They are followed from scan to scan.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -74,22 +75,21 @@ _KEPT = 400  # points of an observation that are kept
 _SAMPLES = 300  # points of an observation that are compared with those of another
 
 
-@dataclass(frozen=True)
-class FoundActor:
-    """A moving actor that free space shows, over time.
+class FoundActor(NamedTuple):
+    """A moving actor, over time.
 
     Attributes:
-        segments: its points in each scan, in order of frames. `velocity` is estimated, and
-            `instance` is its number.
-        rigid: whether it keeps its shape, as vehicles do.
+        segments: its points in each scan, in order of frames. If free space shows it, `velocity` is
+            estimated, and `instance` is its number.
+        rigid: whether it keeps its shape, as vehicles do; None: its class decides.
         confidence: probability that it is real, from 0 to 1: see `_confidence`.
-        path: the result of `estimate_path`.
+        path: the result of `estimate_path`; None: it is not estimated yet.
     """
 
-    segments: tuple[Segment, ...]
-    rigid: bool
-    confidence: float
-    path: Path
+    segments: Sequence[Segment]
+    rigid: bool | None = None
+    confidence: float = 1.0
+    path: Path | None = None
 
 
 class ActorFollower:
@@ -126,7 +126,7 @@ class ActorFollower:
         # in how many scans each cell has points, and in how many clusters
         self._near, self._freed = np.zeros((2, OWN_CELLS**3), np.int64)
         self._cells: dict[int, list[IntArray]] = {}
-        self._shifting: list[int] = []
+        self._beside: list[int] = []
         self._poses: list[Transform] = []
         self._grounds: list[float] = []
         self._close: list[tuple[int, IntArray, IntArray]] = []
@@ -145,7 +145,7 @@ class ActorFollower:
         self._near[scan.near] += 1
         points = np.concatenate([np.empty((0, 3)), *scan.points])
         local = transform_points(invert(scan.world_T_sensor), points)
-        inside = (np.abs(local) < OWN_REACH_M).all(axis=1)
+        inside = np.abs(local).max(axis=1) < OWN_REACH_M
         ends = np.cumsum([0, *map(len, scan.points)])
         for members, one, end in zip(scan.clusters, ends, ends[1:], strict=False):
             if inside[one:end].any():
@@ -166,8 +166,10 @@ class ActorFollower:
         """Return the actors that have not ended, and find the parts of the recording vehicle."""
         actors = self._actors(self._alive)
         own = self._own_cells()
-        for number in self._shifting:
-            own.flat[np.concatenate(self._cells[number])] = False
+        beside = np.zeros_like(own)
+        for number in self._beside:
+            beside.flat[np.concatenate(self._cells[number])] = True
+        own &= ~_widened(beside)
         for number, seen in self._cells.items():
             elsewhere = sum(not len(cells) for cells in seen)
             inside = own.ravel()[np.concatenate(seen)]
@@ -197,34 +199,15 @@ class ActorFollower:
         own &= (across_m < _BESIDE_M)[..., None]
         while (more := _widened(own) & ~own & (freed >= _OFTEN * scans)).any():
             own |= more
-        left, parts = own.copy(), own
-        while left.any():
-            part = np.zeros_like(own)
-            part.flat[left.argmax()] = True
-            while (more := _widened(part) & left & ~part).any():
-                part |= more
-            left &= ~part
-            if self._stands(np.argwhere(part)):
-                parts = parts & ~part
-        return parts
-
-    def _stands(self, cells: IntArray) -> bool:
-        """Return whether (K, 3) cells that touch are of a rider or a person beside the sensor."""
-        if not self._grounds:
-            return False
-        lower, upper = (cells.min(axis=0), cells.max(axis=0) + 1)
-        size = (upper - lower) * OWN_CELL_M
-        foot = float((lower[2] - OWN_CELLS // 2) * OWN_CELL_M) - float(np.median(self._grounds))
-        stands = foot < _FOOT_M and size[2] > _STANDS_M
-        return bool(stands and np.hypot(size[0], size[1]) < _STRETCH_M)
+        return own
 
     def _actors(self, chains: list[_ActorChain]) -> list[FoundActor]:
-        actors = []
+        actors, ground_m = [], float(np.median(self._grounds or [np.nan]))
         for one in chains:
             if actor := one.actor(self._deformable, self._number, self._label):
                 actors.append(actor)
                 self._cells[self._number] = one.cells()
-                self._shifting += [self._number] if one.shifts() else []
+                self._beside += [self._number] if one.is_beside(ground_m) else []
                 self._number += 1
         return actors
 
@@ -394,7 +377,7 @@ class _ActorChain:
             replace(segment, label=label, velocity=velocity, instance=instance)
             for segment, velocity in zip(segments, velocities, strict=True)
         ]
-        return FoundActor(tuple(parts), rigid, confidence, path)
+        return FoundActor(parts, rigid, confidence, path)
 
     def _confidence(
         self,
@@ -455,20 +438,32 @@ class _ActorChain:
         """Return the cells around the sensor in which each observation has points."""
         return [cells_around(points) for points in self._local()]
 
-    def shifts(self) -> bool:
-        """Return whether it is high and does not stay in place in the sensor frame, as all parts of
-        the recording vehicle do.
+    def is_beside(self, ground_m: float) -> bool:
+        """Return whether it is a rider or a person beside the sensor, and no part of the recording
+        vehicle: it stands on the ground, or is high and does not stay in place in the sensor frame.
+
+        `ground_m` is the height of the ground, metres, sensor frame; NaN if it is unknown.
         """
+        local = self._local()
+        lower, upper = (
+            np.median([bound(points, axis=0) for points in local], axis=0)
+            for bound in (np.min, np.max)
+        )
+        length, width, high = upper - lower
+        if (
+            lower[2] - ground_m < _FOOT_M
+            and np.hypot(length, width) < _STRETCH_M
+            and high > _STANDS_M
+        ):
+            return True
         poses = np.stack([link.world_T_sensor for link in self.links])
         seconds = np.array([link.seconds for link in self.links])
         speed = np.gradient(poses[:, :3, 3], seconds, axis=0)
         speed = multiply(invert(poses)[:, :3, :3], speed[..., None])[:, :2, 0]
-        middles = middles_of(self._local())[:, :2]
-        change = speed - speed.mean(axis=0)
+        middles, change = middles_of(local)[:, :2], speed - speed.mean(axis=0)
         delay = (middles * change).sum() / max(np.square(change).sum(), 1e-3)
         left = middles - np.clip(delay, -_DELAY_S, _DELAY_S) * speed
         apart = np.median(np.abs(left - np.median(left, axis=0)), axis=0)
-        high = np.median([link.upper[2] - link.lower[2] for link in self.links])
         return bool(np.hypot(*apart) > _SHIFTS_M and high > _HIGH_M)
 
     def _local(self) -> list[FloatArray]:

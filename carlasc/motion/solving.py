@@ -213,34 +213,23 @@ def smooth_at(
     near = np.flatnonzero(distance <= half_s + 1e-9)
     if len(near) < 4:
         near = np.sort(np.argsort(distance, kind="mergesort")[:4])
-    offsets, wide = seconds[near] - seconds[index], values.shape[1]
+    offsets, own = seconds[near] - seconds[index], values[near]
     degree = 2 if len(near) > 5 else 1 if len(near) > 1 else 0
-    rows, own = np.ones((len(near), degree + 1)), np.empty((len(near), wide))
-    scaled, aimed, weight = np.empty_like(rows), np.empty_like(own), weights[near]
+    rows = np.ones((len(near), degree + 1))
+    for k in range(degree):
+        rows[:, k + 1] = rows[:, k] * offsets
     farthest = max(np.abs(offsets).max(), 1e-9)
-    for i in range(len(near)):
-        own[i] = values[near[i]]
-        for k in range(degree):
-            rows[i, k + 1] = rows[i, k] * offsets[i]
-        weight[i] *= 1 - 0.9 * (abs(offsets[i]) / farthest) ** 3
-    fit, error = np.empty((degree + 1, wide)), np.empty(len(near))
+    weight = weights[near] * (1 - 0.9 * (np.abs(offsets) / farthest) ** 3)
+    fit = np.zeros((2, values.shape[1]))
     for _ in range(3):  # reweighted, so that partly hidden actors do not bend the path
-        for i in range(len(near)):
-            root = np.sqrt(weight[i])
-            scaled[i], aimed[i] = rows[i] * root, own[i] * root
-        fit = least_squares(scaled, aimed)
-        for i in range(len(near)):
-            squared = 0.0
-            for d in range(wide):
-                left = own[i, d]
-                for k in range(degree + 1):
-                    left -= rows[i, k] * fit[k, d]
-                squared += left * left
-            error[i] = np.sqrt(squared)
-        usual = max(3 * np.median(error), 0.02)
-        for i in range(len(near)):
-            weight[i] /= 1 + (error[i] / usual) ** 2
-    return fit[0], fit[1] if degree else np.zeros(wide)
+        root = np.sqrt(weight).reshape(-1, 1)
+        fit = least_squares(rows * root, own * root)
+        left = own.copy()
+        for k in range(degree + 1):
+            left -= rows[:, k].copy().reshape(-1, 1) * fit[k]
+        error = np.sqrt((left * left).sum(axis=1))
+        weight = weight / (1 + (error / max(3 * np.median(error), 0.02)) ** 2)
+    return fit[0], fit[1] if degree else np.zeros_like(fit[0])
 
 
 def resample(

@@ -38,7 +38,6 @@ from carlasc.motion import (
 from carlasc.motion.bodies import surface_of
 from carlasc.motion.boxes import register_boxes
 from carlasc.motion.found_actors import FoundActor
-from carlasc.motion.paths import Path
 from carlasc.motion.refinement import RefinedPoses, ThinnedScan, refine_poses
 from carlasc.motion.tracks import FIRST_FOUND, MovingActors, with_surfaces
 from carlasc.running.processes import run_all
@@ -62,10 +61,6 @@ _ACTORS = 32  # number of actors whose tracks are estimated together
 _SHAPE_POINTS = 128  # number of points of a boxed object in a scan, for its shape and its motion
 _BLOCK = 50, 200  # least and greatest number of frames whose evidence is found in one piece
 
-_Observed = tuple[Chain, bool | None, float, Path | None]
-"""The segments of an actor, whether it is rigid (None: its class decides), its confidence, and its
-path (None: it is not known).
-"""
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -92,7 +87,7 @@ def _find_evidence(*args: Any, **options: Any) -> list[FreeSpaceEvidence]:
     return list(_evidence_of(*args, **options))
 
 
-def _make_track(actor: _Observed, times: dict[int, float], deformable: frozenset[int]) -> Track:
+def _make_track(actor: FoundActor, times: dict[int, float], deformable: frozenset[int]) -> Track:
     """Estimate the track of one actor, in a worker."""
     chain, rigid, sure, path = actor
     return make_track(chain, times, deformable=deformable, rigid=rigid, confidence=sure, path=path)
@@ -102,10 +97,6 @@ def _follow_box(boxed: tuple[Track, list[Segment]], times: dict[int, float]) -> 
     """Register the track of a box to the points in it, in a worker."""
     track, segments = boxed
     return _with_members(register_boxes(track, segments, times), segments)
-
-
-def _observed(actor: FoundActor) -> _Observed:
-    return list(actor.segments), actor.rigid, actor.confidence, actor.path
 
 
 def _each(
@@ -146,18 +137,18 @@ def find_actors(
         first_instance=FIRST_FOUND,
         default_label=0 if feed.has_labels else classes.geometry_id,
     )
-    found, waiting = list[Track](), list[_Observed]()
+    found, waiting = list[Track](), list[FoundActor]()
     # This process gives each scan as soon as it can, so that progress moves.
     is_here = run.executor is None and (run.processes == 1 or len(blocks) == 1)
     find, blocks = (_evidence_of, [tuple(frames)]) if is_here else (_find_evidence, blocks)
     with _each(partial(find, feed=feed, boxes=moving_boxes), blocks, run) as results:
         for evidence in chain.from_iterable(results):
-            waiting += map(_observed, follower.add(evidence))
+            waiting += follower.add(evidence)
             steps(1)
             if len(waiting) >= _ACTORS:
                 found += _estimate(feed, run, waiting)
                 waiting = []
-    found += _estimate(feed, run, [*waiting, *map(_observed, follower.finish())])
+    found += _estimate(feed, run, [*waiting, *follower.finish()])
     found = [track for track in found if track.instance not in follower.riders]
     tracks += found
     # points of what is too large for one actor moved, but not together
@@ -184,7 +175,7 @@ def _linked(feed: ScanFeed, run: Run, steps: Callable[[int], None]) -> list[Trac
                 steps(1)
         if begin + _BATCH >= len(frames):
             ended += linker.finish()
-        tracks += _estimate(feed, run, [(linked, None, 1.0, None) for linked in ended])
+        tracks += _estimate(feed, run, map(FoundActor, ended))
     return tracks
 
 
@@ -208,7 +199,7 @@ def _boxed(
         return with_surfaces(list(tracks))
 
 
-def _estimate(feed: ScanFeed, run: Run, actors: Iterable[_Observed]) -> list[Track]:
+def _estimate(feed: ScanFeed, run: Run, actors: Iterable[FoundActor]) -> list[Track]:
     """Return the tracks of actors."""
     make = partial(_make_track, times=feed.times, deformable=feed.classes.deformable)
     with _each(make, actors, run) as tracks:
