@@ -422,18 +422,6 @@ class _ActorChain:
             )
         )
 
-    def _in_sensor(self) -> list[FloatArray] | None:
-        """Return the (M, 3) points of each observation, metres, sensor frame; None unless they stay
-        in place there while the sensor moves.
-        """
-        driven = np.ptp([link.world_T_sensor[:3, 3] for link in self.links], axis=0).max()
-        local = self._local()
-        middles = middles_of(local)
-        stays = np.median(np.abs(middles - np.median(middles, axis=0)), axis=0).max() < _STAYS_M
-        return (
-            local if stays and driven > _SENSOR_PATH_M and len(local) >= _MIN_OBSERVATIONS else None
-        )
-
     def cells(self) -> list[IntArray]:
         """Return the cells around the sensor in which each observation has points."""
         return [cells_around(points) for points in self._local()]
@@ -476,13 +464,13 @@ class _ActorChain:
         """Return whether its points are of one scan line and move with the sensor, as where a scan
         line meets a rail.
         """
-        local = self._in_sensor()
-        if local is None:
-            return False
+        local = self._local()
+        driven = np.ptp([link.world_T_sensor[:3, 3] for link in self.links], axis=0).max()
+        middles = middles_of(local)
+        stays = np.median(np.abs(middles - np.median(middles, axis=0)), axis=0).max() < _STAYS_M
         x, y, z = np.concatenate(local).T
-        return bool(
-            np.ptp(np.quantile(z / np.maximum(np.hypot(x, y), 1e-3), (0.05, 0.95))) < _LINE_SLOPE
-        )
+        slopes = np.quantile(z / np.maximum(np.hypot(x, y), 1e-3), (0.05, 0.95))
+        return bool(stays and driven > _SENSOR_PATH_M and np.ptp(slopes) < _LINE_SLOPE)
 
 
 def _widened(cells: BoolArray) -> BoolArray:
@@ -580,21 +568,20 @@ def _link(
     apart = [part.thinned(_KEPT) for part in _split(clusters, alive)]
     links = _join_parts(apart, deformable)
     taken = best_pairs(_costs(links, alive) if alive and links else [])
-    chosen = list(set(taken.values()))
+    main = sorted(taken, key=taken.__getitem__)
     # where the chains are expected
-    moved = np.array([alive[j].shift(evidence.seconds) for j in chosen]).reshape(-1, 3)
-    ends = np.array([(alive[j].last.lower, alive[j].last.upper) for j in chosen])
+    moved = np.array([alive[taken[k]].shift(evidence.seconds) for k in main]).reshape(-1, 3)
+    ends = np.array([(alive[taken[k]].last.lower, alive[taken[k]].last.upper) for k in main])
     lower, upper = ends.reshape(-1, 2, 3).swapaxes(0, 1) + moved
     extra = dict[int, int]()
     for i, link in enumerate(links):
         if i not in taken and not _is_rider(link, deformable):
             covers = (link.middle > lower - 0.3) & (link.middle < upper + 0.3)
-            for k in np.flatnonzero(covers[:, :2].all(axis=1)).tolist():
-                if alive[chosen[k]].last.label == link.label:
-                    extra[i] = chosen[k]
-    for i, j in extra.items():
-        main = next(k for k, chain in taken.items() if chain == j)
-        links[main] = links[main].joined(links[i])
+            for row in np.flatnonzero(covers[:, :2].all(axis=1)).tolist():
+                if links[main[row]].label == link.label:
+                    extra[i] = main[row]
+    for i, k in extra.items():
+        links[k] = links[k].joined(links[i])
     fresh = [_ActorChain(link) for i, link in enumerate(links) if i not in taken and i not in extra]
     for i, j in taken.items():
         alive[j].append(links[i])
