@@ -52,7 +52,7 @@ TRACKS, POSES = "tracks", "poses"
 
 # of the methods: a version changes only when the same input gives another result
 _VERSIONS = {
-    TRACKS: 10,
+    TRACKS: 11,
     POSES: 2,
 }
 _NOTED_M = 0.04  # if scans disagree by more and poses do not change, there is a note
