@@ -71,6 +71,11 @@ def transform_points(dst_T_src: Transform, points: AnyFloatArray) -> FloatArray:
     return rotate_vectors(dst_T_src, points) + dst_T_src[:3, 3]
 
 
+def transform_each(dst_T_src: FloatArray, points: AnyFloatArray) -> FloatArray:
+    """Transform (N, 3) points by (N, 4, 4) rigid transforms, each by its own."""
+    return multiply(dst_T_src[:, :3, :3], points[..., None])[..., 0] + dst_T_src[:, :3, 3]
+
+
 def thin(points: NDArray[Floating], most: int) -> NDArray[Floating]:
     """Return every N-th row of an array, with the smallest N that gives at most `most` rows."""
     return points[:: max(1, -(-len(points) // most))]

@@ -131,18 +131,16 @@ class Extent:
         return rear and front and (low or high) and all(self.plausible)
 
 
-def measure(observations: Sequence[FloatArray], sensors: FloatArray) -> Extent:
+def measure(points: FloatArray, counts: AnyIntArray, sensors: FloatArray) -> Extent:
     """Return the size of an actor, as its observations show it.
 
     Args:
-        observations: (M, 3) points of the actor in each scan, metres, actor frame.
+        points: (M, 3) points of the actor in all scans, metres, actor frame.
+        counts: (F,) number of them in each scan.
         sensors: (F, 3) position of the sensor in each scan, metres, actor frame.
     """
-    points = np.concatenate(list(observations))
-    lower, upper = np.quantile(points, _TRIM, axis=0), np.quantile(points, 1 - _TRIM, axis=0)
-    return seen_from(
-        lower, upper, np.array([len(observation) for observation in observations]), sensors
-    )
+    lower, upper = np.quantile(points, (_TRIM, 1 - _TRIM), axis=0)
+    return seen_from(lower, upper, counts, sensors)
 
 
 def seen_from(

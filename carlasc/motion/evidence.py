@@ -150,14 +150,6 @@ class FreeSpaceEvidence:
         times = tuple(own[kept] for own, kept in zip(self.times, rows, strict=True))
         return replace(self, points=points, times=times)
 
-    @property
-    def moved(self) -> BoolArray:
-        """(N,) bool: which points of the scan are in a cluster."""
-        flags = np.zeros(self.count, np.bool_)
-        for members in self.clusters:
-            flags[members] = True
-        return flags
-
 
 @dataclass(frozen=True)
 class _Kept:

@@ -5,8 +5,9 @@ They are followed from scan to scan.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from carlasc.motion.evidence import (
     FreeSpaceEvidence,
     cells_around,
 )
-from carlasc.motion.paths import Segment, estimate_path, is_static, middles_of, misalignment
+from carlasc.motion.paths import Path, Segment, is_static, middles_of, misalignment, path_of
 from carlasc.motion.planes import nearest_points
 from carlasc.motion.solving import best_pairs
 
@@ -57,36 +58,38 @@ _LEAST_CONFIDENCE = 0.5  # of an actor
 _STAYS_M, _SENSOR_PATH_M = 0.5, 1.0  # points that move with the sensor, while it drives so far
 _LINE_SLOPE = 0.004  # a quarter of a degree: the points of one scan line differ by less
 # Parts of the recording vehicle: cells around the sensor in which nearly all scans have points,
-# often at places that were free at other times; and cells beside them with such points. Deskewing
-# moves such parts by decimetres whenever the speed changes, so that they do not look rigid: they
-# cannot be told from a person who walks beside the sensor at exactly its pace.
+# often at places that were free at other times; and cells beside them with such points.
 _ALWAYS, _FREED, _OFTEN = 0.95, 0.3, 0.3
 _BESIDE_M = 1.8  # farther beside the way of the sensor, another vehicle may drive along
 # What stands on the ground beside the sensor is a rider or a person, who keeps its pace: so near
-# above the ground, and so high and not longer.
+# above the ground, and so high and not longer. So is what is so high and shifts by so much beside
+# the sensor: the median. A delay of at most so long, as of deskewing, moves parts as the speed
+# changes.
 _FOOT_M, _STANDS_M, _STRETCH_M = 0.6, 1.0, 2.6
+_HIGH_M, _SHIFTS_M, _DELAY_S = 0.5, 0.04, 0.1
 _OWN_SHARE = 0.5  # an actor with so many points in these cells is none
 # A cluster is split between chains of so many observations, whose middles are expected so near to
 # it, and whose velocities differ by so much. So many points of their last ones stand for them.
 _KNOWN, _NEAR_M, _APART_M_S, _MODEL = 3, 0.2, 1.0, 80
 _KEPT = 400  # points of an observation that are kept
-_SAMPLES = 300  # points of an observation that its path is estimated from
+_SAMPLES = 300  # points of an observation that are compared with those of another
 
 
-@dataclass(frozen=True)
-class FoundActor:
-    """A moving actor that free space shows, over time.
+class FoundActor(NamedTuple):
+    """A moving actor, over time.
 
     Attributes:
-        segments: its points in each scan, in order of frames. `velocity` is estimated, and
-            `instance` is its number.
-        rigid: whether it keeps its shape, as vehicles do.
+        segments: its points in each scan, in order of frames. If free space shows it, `velocity` is
+            estimated, and `instance` is its number.
+        rigid: whether it keeps its shape, as vehicles do; None: its class decides.
         confidence: probability that it is real, from 0 to 1: see `_confidence`.
+        path: the result of `estimate_path`; None: it is not estimated yet.
     """
 
-    segments: tuple[Segment, ...]
-    rigid: bool
-    confidence: float
+    segments: Sequence[Segment]
+    rigid: bool | None = None
+    confidence: float = 1.0
+    path: Path | None = None
 
 
 class ActorFollower:
@@ -123,6 +126,7 @@ class ActorFollower:
         # in how many scans each cell has points, and in how many clusters
         self._near, self._freed = np.zeros((2, OWN_CELLS**3), np.int64)
         self._cells: dict[int, list[IntArray]] = {}
+        self._beside: list[int] = []
         self._poses: list[Transform] = []
         self._grounds: list[float] = []
         self._close: list[tuple[int, Int32Array, IntArray]] = []
@@ -140,13 +144,16 @@ class ActorFollower:
         if np.isfinite(scan.ground_m):
             self._grounds.append(scan.ground_m)
         self._near[scan.near] += 1
-        sensor_T_world = invert(scan.world_T_sensor)
-        for members, points in zip(scan.clusters, scan.points, strict=True):
-            local = transform_points(sensor_T_world, points)
-            cells = cells_around(local)
-            self._freed[cells] += 1
-            if len(cells) and np.abs(local).max() < OWN_REACH_M:
-                self._close.append((scan.frame, members.astype(np.int32), cells))
+        points = np.concatenate([np.empty((0, 3)), *scan.points])
+        local = transform_points(invert(scan.world_T_sensor), points)
+        inside = np.abs(local).max(axis=1) < OWN_REACH_M
+        ends = np.cumsum([0, *map(len, scan.points)])
+        for members, one, end in zip(scan.clusters, ends, ends[1:], strict=False):
+            if inside[one:end].any():
+                cells = cells_around(local[one:end])
+                self._freed[cells] += 1
+                if inside[one:end].all():
+                    self._close.append((scan.frame, members.astype(np.int32), cells))
         before, self._alive = self._alive, []
         ended = list[_ActorChain]()
         for one in before:
@@ -160,6 +167,10 @@ class ActorFollower:
         """Return the actors that have not ended, and find the parts of the recording vehicle."""
         actors = self._actors(self._alive)
         own = self._own_cells()
+        beside = np.zeros_like(own)
+        for number in self._beside:
+            beside.flat[np.concatenate(self._cells[number])] = True
+        own &= ~_widened(beside)
         for number, seen in self._cells.items():
             elsewhere = sum(not len(cells) for cells in seen)
             inside = own.ravel()[np.concatenate(seen)]
@@ -189,33 +200,15 @@ class ActorFollower:
         own &= (across_m < _BESIDE_M)[..., None]
         while (more := _widened(own) & ~own & (freed >= _OFTEN * scans)).any():
             own |= more
-        left, parts = own.copy(), own
-        while left.any():
-            part = np.zeros_like(own)
-            part.flat[left.argmax()] = True
-            while (more := _widened(part) & left & ~part).any():
-                part |= more
-            left &= ~part
-            if self._stands(np.argwhere(part)):
-                parts = parts & ~part
-        return parts
-
-    def _stands(self, cells: IntArray) -> bool:
-        """Return whether (K, 3) cells that touch are of a rider or a person beside the sensor."""
-        if not self._grounds:
-            return False
-        lower, upper = (cells.min(axis=0), cells.max(axis=0) + 1)
-        size = (upper - lower) * OWN_CELL_M
-        foot = float((lower[2] - OWN_CELLS // 2) * OWN_CELL_M) - float(np.median(self._grounds))
-        stands = foot < _FOOT_M and size[2] > _STANDS_M
-        return bool(stands and np.hypot(size[0], size[1]) < _STRETCH_M)
+        return own
 
     def _actors(self, chains: list[_ActorChain]) -> list[FoundActor]:
-        actors = []
+        actors, ground_m = [], float(np.median(self._grounds or [np.nan]))
         for one in chains:
             if actor := one.actor(self._deformable, self._number, self._label):
                 actors.append(actor)
                 self._cells[self._number] = one.cells()
+                self._beside += [self._number] if one.is_beside(ground_m) else []
                 self._number += 1
         return actors
 
@@ -328,7 +321,8 @@ class _ActorChain:
         # The visible faces change: the velocities of the lower corner, the middle and the upper
         # corner are compared, and the lowest one counts.
         offsets = seconds - seconds.mean()
-        corners = np.stack([[link.lower, link.middle, link.upper] for link in recent])
+        lower, upper = np.array([(link.lower, link.upper) for link in recent]).swapaxes(0, 1)
+        corners = np.stack([lower, (lower + upper) / 2, upper], axis=1)
         slopes = (offsets[:, None, None] * corners).sum(axis=0) / np.square(offsets).sum()
         least = np.take_along_axis(slopes, np.abs(slopes).argmin(axis=0)[None], axis=0)[0]
         return np.where(np.abs(slopes).max(axis=0) > 0, (least + slopes[1]) / 2, 0.0)
@@ -345,12 +339,6 @@ class _ActorChain:
         assert self.velocity is not None and other.velocity is not None
         return float(np.hypot(*(self.velocity - other.velocity)[:2])) > _APART_M_S
 
-    def covers(self, link: _Link) -> bool:
-        """Return whether an observation is inside the place that is expected of the next one."""
-        shift = self.shift(link.seconds)
-        lower, upper = self.last.lower + shift - 0.3, self.last.upper + shift + 0.3
-        return bool(((link.middle > lower) & (link.middle < upper))[:2].all())
-
     def actor(
         self, deformable: Collection[int], instance: int, default_label: int
     ) -> FoundActor | None:
@@ -365,13 +353,9 @@ class _ActorChain:
         label = int(votes.argmax()) or default_label
         sizes = np.quantile([link.upper - link.lower for link in self.links], 0.8, axis=0)
         rigid = label not in deformable if votes.argmax() and deformable else not _is_small(sizes)
-        thinned = [segment.thinned(_SAMPLES) for segment in segments]
-        samples = [segment.points for segment in thinned]
-        delays = [s.times for s in thinned] if thinned[0].times is not None else None
-        positions, velocities, headings = estimate_path(
-            samples, seconds, rigid=rigid, delays=delays
-        )
-        samples = [few.at_frame(v).points for few, v in zip(thinned, velocities, strict=True)]
+        path = positions, velocities, headings = path_of(segments, seconds, rigid=rigid)
+        segments = [s.at_frame(v) for s, v in zip(segments, velocities, strict=True)]
+        samples = [segment.points for segment in segments]
         speeds = np.linalg.norm(velocities[:, :2], axis=1)
         if (
             np.ptp(positions[:, :2], axis=0).max() < _MIN_PATH_M
@@ -391,10 +375,10 @@ class _ActorChain:
         if confidence < _LEAST_CONFIDENCE:
             return None
         parts = [
-            replace(segment.at_frame(velocity), label=label, velocity=velocity, instance=instance)
+            replace(segment, label=label, velocity=velocity, instance=instance)
             for segment, velocity in zip(segments, velocities, strict=True)
         ]
-        return FoundActor(tuple(parts), rigid, confidence)
+        return FoundActor(parts, rigid, confidence, path)
 
     def _confidence(
         self,
@@ -439,25 +423,41 @@ class _ActorChain:
             )
         )
 
-    def _in_sensor(self) -> list[FloatArray] | None:
-        """Return the (M, 3) points of each observation, metres, sensor frame; None unless they stay
-        in place there while the sensor moves.
-        """
-        driven = np.ptp([link.world_T_sensor[:3, 3] for link in self.links], axis=0).max()
-        local = [
-            transform_points(invert(link.world_T_sensor), link.segment.points)
-            for link in self.links
-        ]
-        middles = middles_of(local)
-        stays = np.median(np.abs(middles - np.median(middles, axis=0)), axis=0).max() < _STAYS_M
-        return (
-            local if stays and driven > _SENSOR_PATH_M and len(local) >= _MIN_OBSERVATIONS else None
-        )
-
     def cells(self) -> list[IntArray]:
         """Return the cells around the sensor in which each observation has points."""
+        return [cells_around(points) for points in self._local()]
+
+    def is_beside(self, ground_m: float) -> bool:
+        """Return whether it is a rider or a person beside the sensor, and no part of the recording
+        vehicle: it stands on the ground, or is high and does not stay in place in the sensor frame.
+
+        `ground_m` is the height of the ground, metres, sensor frame; NaN if it is unknown.
+        """
+        local = self._local()
+        lower, upper = (
+            np.median([bound(points, axis=0) for points in local], axis=0)
+            for bound in (np.min, np.max)
+        )
+        length, width, high = upper - lower
+        if (
+            lower[2] - ground_m < _FOOT_M
+            and np.hypot(length, width) < _STRETCH_M
+            and high > _STANDS_M
+        ):
+            return True
+        poses = np.stack([link.world_T_sensor for link in self.links])
+        seconds = np.array([link.seconds for link in self.links])
+        speed = np.gradient(poses[:, :3, 3], seconds, axis=0)
+        speed = multiply(invert(poses)[:, :3, :3], speed[..., None])[:, :2, 0]
+        middles, change = middles_of(local)[:, :2], speed - speed.mean(axis=0)
+        delay = (middles * change).sum() / max(np.square(change).sum(), 1e-3)
+        left = middles - np.clip(delay, -_DELAY_S, _DELAY_S) * speed
+        apart = np.median(np.abs(left - np.median(left, axis=0)), axis=0)
+        return bool(np.hypot(*apart) > _SHIFTS_M and high > _HIGH_M)
+
+    def _local(self) -> list[FloatArray]:
         return [
-            cells_around(transform_points(invert(link.world_T_sensor), link.segment.points))
+            transform_points(invert(link.world_T_sensor), link.segment.points)
             for link in self.links
         ]
 
@@ -465,13 +465,13 @@ class _ActorChain:
         """Return whether its points are of one scan line and move with the sensor, as where a scan
         line meets a rail.
         """
-        local = self._in_sensor()
-        if local is None:
-            return False
+        local = self._local()
+        driven = np.ptp([link.world_T_sensor[:3, 3] for link in self.links], axis=0).max()
+        middles = middles_of(local)
+        stays = np.median(np.abs(middles - np.median(middles, axis=0)), axis=0).max() < _STAYS_M
         x, y, z = np.concatenate(local).T
-        return bool(
-            np.ptp(np.quantile(z / np.maximum(np.hypot(x, y), 1e-3), (0.05, 0.95))) < _LINE_SLOPE
-        )
+        slopes = np.quantile(z / np.maximum(np.hypot(x, y), 1e-3), (0.05, 0.95))
+        return bool(stays and driven > _SENSOR_PATH_M and np.ptp(slopes) < _LINE_SLOPE)
 
 
 def _widened(cells: BoolArray) -> BoolArray:
@@ -568,19 +568,21 @@ def _link(
     clusters = [_Link.of(evidence, index) for index in range(len(evidence.clusters))]
     apart = [part.thinned(_KEPT) for part in _split(clusters, alive)]
     links = _join_parts(apart, deformable)
-    taken = best_pairs(_costs(links, alive) if alive else [])
-    extra = {
-        i: j
-        for i in range(len(links))
-        if i not in taken
-        for j in set(taken.values())
-        if alive[j].last.label == links[i].label
-        and not _is_rider(links[i], deformable)
-        and alive[j].covers(links[i])
-    }
-    for i, j in extra.items():
-        main = next(k for k, chain in taken.items() if chain == j)
-        links[main] = links[main].joined(links[i])
+    taken = best_pairs(_costs(links, alive) if alive and links else [])
+    main = sorted(taken, key=taken.__getitem__)
+    # where the chains are expected
+    moved = np.array([alive[taken[k]].shift(evidence.seconds) for k in main]).reshape(-1, 3)
+    ends = np.array([(alive[taken[k]].last.lower, alive[taken[k]].last.upper) for k in main])
+    lower, upper = ends.reshape(-1, 2, 3).swapaxes(0, 1) + moved
+    extra = dict[int, int]()
+    for i, link in enumerate(links):
+        if i not in taken and not _is_rider(link, deformable):
+            covers = (link.middle > lower - 0.3) & (link.middle < upper + 0.3)
+            for row in np.flatnonzero(covers[:, :2].all(axis=1)).tolist():
+                if links[main[row]].label == link.label:
+                    extra[i] = main[row]
+    for i, k in extra.items():
+        links[k] = links[k].joined(links[i])
     fresh = [_ActorChain(link) for i, link in enumerate(links) if i not in taken and i not in extra]
     for i, j in taken.items():
         alive[j].append(links[i])
@@ -600,18 +602,20 @@ def _costs(links: list[_Link], alive: list[_ActorChain]) -> list[tuple[float, in
     velocity = np.stack(
         [np.zeros(3) if chain.velocity is None else chain.velocity for chain in alive]
     )
-    costs = list[tuple[float, int, int]]()
-    for i, link in enumerate(links):
-        elapsed = link.seconds - seconds
-        shift = velocity * elapsed[:, None]
-        gap = np.maximum(np.maximum(lower + shift - link.upper, link.lower - upper - shift), 0.0)
-        offset = link.middle - middle - shift
-        reach = _REACH_M + np.where(fresh, np.minimum(_MAX_SPEED_M_S * elapsed, 4.0), 0.0)
-        aside = np.linalg.norm(offset[:, :2], axis=1)
-        can = (label == link.segment.label) & (np.abs(middle - link.middle).max(axis=1) < _FAR_M)
-        can &= (np.linalg.norm(gap[:, :2], axis=1) <= reach) & (gap[:, 2] <= _REACH_M)
-        can &= aside <= 3 * reach + 2.0
-        sizes = np.abs((link.upper - link.lower) - size).sum(axis=1)
-        cost = np.linalg.norm(gap, axis=1) + 0.3 * aside + 0.2 * sizes
-        costs += [(float(cost[j]), i, j) for j in np.flatnonzero(can).tolist()]
-    return costs
+    # (L, A, 3): of each observation and each chain
+    low, high, at = (
+        np.stack([getattr(link, name) for link in links])[:, None]
+        for name in ("lower", "upper", "middle")
+    )
+    elapsed = links[0].seconds - seconds
+    shift = velocity * elapsed[:, None]
+    gap = np.maximum(np.maximum(lower + shift - high, low - upper - shift), 0.0)
+    reach = _REACH_M + np.where(fresh, np.minimum(_MAX_SPEED_M_S * elapsed, 4.0), 0.0)
+    aside = np.linalg.norm((at - middle - shift)[..., :2], axis=-1)
+    can = label == np.array([link.label for link in links])[:, None]
+    can &= np.abs(middle - at).max(axis=-1) < _FAR_M
+    can &= (np.linalg.norm(gap[..., :2], axis=-1) <= reach) & (gap[..., 2] <= _REACH_M)
+    can &= aside <= 3 * reach + 2.0
+    sizes = np.abs((high - low) - size).sum(axis=-1)
+    cost = np.linalg.norm(gap, axis=-1) + 0.3 * aside + 0.2 * sizes
+    return [(float(cost[i, j]), i, j) for i, j in np.argwhere(can).tolist()]

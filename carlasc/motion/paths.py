@@ -103,13 +103,25 @@ class Segment:
         return self if self.times is None else replace(self, points=points, times=None)
 
 
+Path = tuple[FloatArray, FloatArray, FloatArray]
+"""(F, 3) positions, metres, world, (F, 3) velocities, m/s, world, and (F,) headings, radians, of an
+actor at each of its observations.
+"""
+
+
+def path_of(segments: Sequence[Segment], seconds: FloatArray, *, rigid: bool) -> Path:
+    """Estimate the path of an actor from its segments: see `estimate_path`."""
+    delays = [s.times for s in segments] if any(s.times is not None for s in segments) else None
+    return estimate_path([s.points for s in segments], seconds, rigid=rigid, delays=delays)
+
+
 def estimate_path(
     observations: Sequence[FloatArray],
     seconds: FloatArray,
     *,
     rigid: bool,
     delays: Sequence[AnyFloatArray | None] | None = None,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> Path:
     """Estimate the position, the velocity and the heading of an actor at each of its observations.
 
     Rigid actors are registered, so the result does not depend on the side that is visible. People

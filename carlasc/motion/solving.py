@@ -10,7 +10,6 @@ import numpy as np
 
 from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.compiling import cached
-from carlasc.core.geometry import multiply
 
 _HEADING_SPEED_M_S = 1.0  # above it, the heading is the direction of motion
 _SWEEPS = 12  # greatest number for Jacobi's method, which takes about five
@@ -201,6 +200,7 @@ def smooth(
     return smoothed, slopes
 
 
+@cached(error_model="python")
 def smooth_at(
     index: int,
     values: FloatArray,
@@ -212,23 +212,24 @@ def smooth_at(
     distance = np.abs(seconds - seconds[index])
     near = np.flatnonzero(distance <= half_s + 1e-9)
     if len(near) < 4:
-        near = np.sort(np.argsort(distance, kind="stable")[:4])
-    offsets = seconds[near] - seconds[index]
+        near = np.sort(np.argsort(distance, kind="mergesort")[:4])
+    offsets, own = seconds[near] - seconds[index], values[near]
     degree = 2 if len(near) > 5 else 1 if len(near) > 1 else 0
-    design, own = offsets[:, None] ** np.arange(degree + 1), values[near]
-    weight = weights[near] * (1 - 0.9 * (np.abs(offsets) / max(np.abs(offsets).max(), 1e-9)) ** 3)
+    rows = np.ones((len(near), degree + 1))
+    for k in range(degree):
+        rows[:, k + 1] = rows[:, k] * offsets
+    farthest = max(np.abs(offsets).max(), 1e-9)
+    weight = weights[near] * (1 - 0.9 * (np.abs(offsets) / farthest) ** 3)
+    fit = np.zeros((2, values.shape[1]))
     for _ in range(3):  # reweighted, so that partly hidden actors do not bend the path
-        root = np.sqrt(weight)[:, None]
-        fit = least_squares(design * root, own * root)
-        error = np.linalg.norm(own - multiply(design, fit), axis=1)
-        weight = weight / (1 + (error / max(3 * _median(error), 0.02)) ** 2)
+        root = np.sqrt(weight).reshape(-1, 1)
+        fit = least_squares(rows * root, own * root)
+        left = own.copy()
+        for k in range(degree + 1):
+            left -= rows[:, k].copy().reshape(-1, 1) * fit[k]
+        error = np.sqrt((left * left).sum(axis=1))
+        weight = weight / (1 + (error / max(3 * np.median(error), 0.02)) ** 2)
     return fit[0], fit[1] if degree else np.zeros_like(fit[0])
-
-
-def _median(values: FloatArray) -> float:
-    """Return the median of (N,) values, N > 0; for few, `np.median` takes five times as long."""
-    ranked, half = np.sort(values), len(values) // 2
-    return float(ranked[half]) if len(values) % 2 else float((ranked[half - 1] + ranked[half]) / 2)
 
 
 def resample(

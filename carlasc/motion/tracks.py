@@ -27,12 +27,12 @@ from carlasc.core.geometry import (
     multiply,
     rotate_vectors,
     rotation_z,
-    transform_points,
+    transform_each,
     translation,
 )
 from carlasc.errors import reading
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent, Sizes, measure, surface_of
-from carlasc.motion.paths import Segment, estimate_path, is_static
+from carlasc.motion.paths import Path, Segment, is_static, path_of
 from carlasc.motion.segments import MIN_SPEED_M_S
 from carlasc.motion.solving import headings_of, resample, smooth
 from carlasc.storage.arrays import ArrayFormat, open_npz
@@ -151,6 +151,7 @@ def make_track(
     deformable: Collection[int] = (),
     rigid: bool | None = None,
     confidence: float = 1.0,
+    path: Path | None = None,
 ) -> Track:
     """Return the track of linked segments: their path, the poses along it, and the box around all
     points.
@@ -161,20 +162,18 @@ def make_track(
         deformable: classes whose actors change their shape.
         rigid: whether this actor keeps its shape; None: its class decides.
         confidence: probability that the actor is real.
+        path: at the times of the segments, if it is known, and the actor moves.
     """
     seconds = np.array([times[segment.frame] for segment in chain])
     label = int(np.bincount([s.label for s in chain], [len(s.members) for s in chain]).argmax())
     # Flow gives the path directly. Without it, the path is found by aligning the observations.
     keeps_shape = label not in deformable if rigid is None else rigid
-    if any(segment.velocity is None for segment in chain):
-        observations = [segment.points for segment in chain]
-        delays = [s.times for s in chain] if any(s.times is not None for s in chain) else None
-        positions, velocities, headings = estimate_path(
-            observations, seconds, rigid=keeps_shape, delays=delays
-        )
+    if path is not None or any(segment.velocity is None for segment in chain):
+        estimated = path_of(chain, seconds, rigid=keeps_shape) if path is None else path
+        positions, velocities, headings = estimated
         chain = [segment.at_frame(v) for segment, v in zip(chain, velocities, strict=True)]
         observations = [segment.points for segment in chain]
-        if is_static(observations, positions, headings, seconds):
+        if path is None and is_static(observations, positions, headings, seconds):
             positions, velocities, headings = (
                 np.zeros_like(values) for values in (positions, velocities, headings)
             )
@@ -188,9 +187,9 @@ def make_track(
         positions, headings = _integrate(velocities, seconds, chain), headings_of(velocities)
     positions, extent, body = _fit_box(chain, positions, headings)
     frames, at = _frames_around(chain[0].frame, chain[-1].frame, times)
-    path, speed = resample(at, seconds, positions, velocities)
+    places, speed = resample(at, seconds, positions, velocities)
     poses = np.stack([rotation_z(angle) for angle in np.interp(at, seconds, headings)])
-    poses[:, :3, 3] = path
+    poses[:, :3, 3] = places
     members = {segment.frame: segment.members.astype(np.int32) for segment in chain}
     lower, upper = extent.lower - BODY_MARGIN_M, extent.upper + BODY_MARGIN_M
     surface = surface_of(body if keeps_shape and extent.exemplary else body[:0])
@@ -305,21 +304,22 @@ def _fit_box(
     overlap only with the correct offset, which moves the origin to their centre.
     """
     best = int(np.argmax([len(segment.members) for segment in chain]))
+    counts = np.array([len(segment.points) for segment in chain])
+    points = np.concatenate([segment.points for segment in chain])
+    origins = np.stack([segment.origin for segment in chain])
+    poses = np.stack([rotation_z(heading) for heading in headings])
     # Moving the origin changes which points overlap, and thus the extent: three rounds, of which
     # the last one changes millimetres.
     for _ in range(3):
-        body, sensors = [], []
-        for segment, position, heading in zip(chain, positions, headings, strict=True):
-            pose = rotation_z(heading)
-            pose[:3, 3] = position
-            actor_T_world = invert(pose)
-            body.append(transform_points(actor_T_world, segment.points))
-            sensors.append(transform_points(actor_T_world, segment.origin))
-        extent = measure(body, np.stack(sensors))
+        poses[:, :3, 3] = positions
+        actor_T_world = invert(poses)
+        sensors = transform_each(actor_T_world, origins)
+        body = transform_each(np.repeat(actor_T_world, counts, axis=0), points)
+        extent = measure(body, counts, sensors)
         middle = (extent.lower + extent.upper) / 2
         positions = positions + rotate_vectors(rotation_z(headings[best]), middle)
         extent = replace(extent, lower=extent.lower - middle, upper=extent.upper - middle)
-    return positions, extent, np.concatenate(body) - middle
+    return positions, extent, body - middle
 
 
 def _frames_around(

@@ -9,6 +9,12 @@ from carlasc.errors import FormatError
 from carlasc.motion.evidence import HORIZON_S, EvidenceScan, find_evidence
 
 
+def moved_of(evidence):
+    flags = np.zeros(evidence.count, bool)
+    flags[np.concatenate([np.empty(0, int), *evidence.clusters])] = True
+    return flags
+
+
 def shares(filmed, first=0, last=10**9):
     """Return the share of moved points of each class over frames, without those on the ground."""
     scans, classes = zip(*filmed, strict=True)
@@ -18,7 +24,7 @@ def shares(filmed, first=0, last=10**9):
         if first <= scan.frame <= last:
             high = place_height(scan) > 0.25
             counts += np.bincount(labels[high], minlength=20)
-            moved += np.bincount(labels[high], evidence.moved[high], minlength=20)
+            moved += np.bincount(labels[high], moved_of(evidence)[high], minlength=20)
     return moved / np.maximum(counts, 1)
 
 
@@ -78,7 +84,7 @@ def test_nothing_moves_on_empty_ground_or_in_a_single_scan():
     assert not shares(film(passing, 1)).any()
     empty = EvidenceScan(0, np.empty((0, 3), np.float32), np.eye(4), 0.0)
     (evidence,) = find_evidence([empty])
-    assert evidence.clusters == () and evidence.moved.shape == (0,)
+    assert evidence.clusters == () and evidence.count == 0
 
 
 def test_explained_points_are_no_evidence():

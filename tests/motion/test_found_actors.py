@@ -163,3 +163,13 @@ def test_a_car_beside_the_sensor_that_keeps_its_speed_is_not_the_recording_vehic
     found = find_actors(scan for scan, _ in filmed)
     (actor,) = found.tracked
     assert actor.confidence > 0.8 and found.own == ()
+
+
+def test_a_rider_who_keeps_nearly_the_pace_beside_the_sensor_is_no_part_of_the_vehicle():
+    rider = (1.7, 0.6, 1.6)
+    filmed = film(
+        lambda t: [*WALLS, box(6.1 * t - 0.9, -2.0, rider, CAR)], 24, ego_m_s=6.0, lidar=COARSE
+    )
+    found = find_actors(scan for scan, _ in filmed)
+    (actor,) = found.tracked
+    assert found.own == () and abs(actor.segments[0].velocity[0] - 6.1) < 0.3

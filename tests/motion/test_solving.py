@@ -5,7 +5,6 @@ import pytest
 
 from carlasc.core.geometry import rotation_z
 from carlasc.motion.solving import (
-    _median,
     least_squares,
     nearest_rotation,
     principal_axes,
@@ -104,9 +103,3 @@ def test_one_time_alone_is_smoothed_as_among_all():
         assert np.array_equal(
             smooth_at(index, values, TIMES, weights, 0.4), (smoothed[index], slopes[index])
         )
-
-
-@pytest.mark.parametrize("count", [1, 2, 5, 8])
-def test_the_weights_of_outliers_follow_the_median_of_numpy(count):
-    values = np.random.default_rng(count).exponential(size=count)
-    assert _median(values) == np.median(values)

@@ -46,7 +46,7 @@ RECENT_S = 0.25  # scans within this time before and after a frame show the scen
 # Points so near to the body of an actor may belong to it, as paths have errors: metres along,
 # across and up.
 _AROUND_M = np.array([0.3, 0.3, 0.1])
-_UNDER_M = np.array([0.0, 0.0, 0.2])  # ground so far below that may be of its wheels or feet
+_UNDER_M = np.array([0.1, 0.1, 0.3])  # ground so near to it, and below, may be of wheels or feet
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 _ByClass = dict[int, tuple[Float32Array, Float32Array | None]]  # points and their probabilities
 
@@ -436,13 +436,14 @@ class Merger:
             for track in self.actors.tracks.values():
                 static[track.members.get(frame, [])] = False
                 lower, upper = track.lower - _AROUND_M, track.upper + _AROUND_M
-                least = lower - _UNDER_M
-                for rays, actor_T_place, crossing in scan.through(track, least, upper):
+                least, most = track.lower - _UNDER_M, track.upper + _UNDER_M
+                corners = np.minimum(lower, least), np.maximum(upper, most)
+                for rays, actor_T_place, crossing in scan.through(track, *corners):
                     body = transform_points(actor_T_place, rays.points[crossing])
-                    inside = ((body >= least) & (body <= upper)).all(axis=1)
-                    near = rays.part.start + crossing[inside]
-                    under[near[ground[near]]] = True
-                    static[near[~ground[near] & (body[inside, 2] >= lower[2])]] = False
+                    near = rays.part.start + crossing
+                    inside = ((body >= lower) & (body <= upper)).all(axis=1) & ~ground[near]
+                    below = ((body >= least) & (body <= most)).all(axis=1) & ground[near]
+                    static[near[inside]], under[near[below]] = False, True
             self._static[frame] = static, under
         return self._static[frame][0]
 

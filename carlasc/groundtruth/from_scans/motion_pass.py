@@ -54,7 +54,7 @@ a drive until all are refined, in the folder of derived results.
 
 # of the methods: a version changes only when the same input gives another result
 _VERSIONS = {
-    TRACKS: 10,
+    TRACKS: 11,
     POSES: 2,
 }
 _NOTED_M = 0.04  # if scans disagree by more and poses do not change, there is a note
@@ -63,8 +63,6 @@ _ACTORS = 32  # number of actors whose tracks are estimated together
 _SHAPE_POINTS = 128  # number of points of a boxed object in a scan, for its shape and its motion
 _BLOCK = 50, 200  # least and greatest number of frames whose evidence is found in one piece
 
-_Observed = tuple[Chain, bool | None, float]
-"""The segments of an actor, whether it is rigid (None: its class decides), and its confidence."""
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -91,21 +89,16 @@ def _find_evidence(*args: Any, **options: Any) -> list[FreeSpaceEvidence]:
     return list(_evidence_of(*args, **options))
 
 
-def _make_track(actor: _Observed, times: dict[int, float], deformable: frozenset[int]) -> Track:
+def _make_track(actor: FoundActor, times: dict[int, float], deformable: frozenset[int]) -> Track:
     """Estimate the track of one actor, in a worker."""
-    chain, rigid, confidence = actor
-    return make_track(chain, times, deformable=deformable, rigid=rigid, confidence=confidence)
+    chain, rigid, sure, path = actor
+    return make_track(chain, times, deformable=deformable, rigid=rigid, confidence=sure, path=path)
 
 
 def _follow_box(boxed: tuple[Track, list[Segment]], times: dict[int, float]) -> Track:
     """Register the track of a box to the points in it, in a worker."""
     track, segments = boxed
     return _with_members(register_boxes(track, segments, times), segments)
-
-
-def _observed(actor: FoundActor) -> _Observed:
-    # its path is estimated again: integrated velocities would drift
-    return [replace(s, velocity=None) for s in actor.segments], actor.rigid, actor.confidence
 
 
 def _each(
@@ -146,18 +139,18 @@ def find_actors(
         first_instance=FIRST_FOUND,
         default_label=0 if feed.has_labels else classes.geometry_id,
     )
-    found, waiting = list[Track](), list[_Observed]()
+    found, waiting = list[Track](), list[FoundActor]()
     # This process gives each scan as soon as it can, so that progress moves.
     is_here = run.executor is None and (run.processes == 1 or len(blocks) == 1)
     find, blocks = (_evidence_of, [tuple(frames)]) if is_here else (_find_evidence, blocks)
     with _each(partial(find, feed=feed, boxes=moving_boxes), blocks, run) as results:
         for evidence in chain.from_iterable(results):
-            waiting += map(_observed, follower.add(evidence))
+            waiting += follower.add(evidence)
             steps(1)
             if len(waiting) >= _ACTORS:
                 found += _estimate(feed, run, waiting)
                 waiting = []
-    found += _estimate(feed, run, [*waiting, *map(_observed, follower.finish())])
+    found += _estimate(feed, run, [*waiting, *follower.finish()])
     found = [track for track in found if track.instance not in follower.riders]
     tracks += found
     # points of what is too large for one actor moved, but not together
@@ -184,7 +177,7 @@ def _linked(feed: ScanFeed, run: Run, steps: Callable[[int], None]) -> list[Trac
                 steps(1)
         if begin + _BATCH >= len(frames):
             ended += linker.finish()
-        tracks += _estimate(feed, run, [(linked, None, 1.0) for linked in ended])
+        tracks += _estimate(feed, run, map(FoundActor, ended))
     return tracks
 
 
@@ -208,7 +201,7 @@ def _boxed(
         return with_surfaces(list(tracks))
 
 
-def _estimate(feed: ScanFeed, run: Run, actors: Iterable[_Observed]) -> list[Track]:
+def _estimate(feed: ScanFeed, run: Run, actors: Iterable[FoundActor]) -> list[Track]:
     """Return the tracks of actors."""
     make = partial(_make_track, times=feed.times, deformable=feed.classes.deformable)
     with _each(make, actors, run) as tracks:
