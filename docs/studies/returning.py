@@ -13,11 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from carlasc_recorders import TownActor, TownDrive
 from carlasc_recorders.town.actors import Population
-from carlasc_recorders.town.drive import _NOISE, Snapshot, _cast
+from carlasc_recorders.town.drive import _NOISE, Snapshot, _scan
+from carlasc_recorders.town.returns import Luck
 from carlasc_recorders.town.streets import HALF_ROAD_M, Streets, right_of
 from numpy.typing import NDArray
 
-from carlasc.captures import Lidar, SensorRecording
+from carlasc.captures import Lidar, LidarEffects, SensorRecording
 from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.storage.layout import FRAME_PERIOD_S
 
@@ -131,9 +132,9 @@ class ReturningDrive(TownDrive):
         if self._world is None or away > _KEPT_M or ids != self._world.actors.keys():
             self._world = self._place(frame, ego, still)
         moving = self._place(frame, ego, others, with_town=False)
-        bound, rays = self.lidar.noise_m, self.lidar.directions.shape
-        noise = self._random(_NOISE, frame, sensor).uniform(-bound, bound, rays)
-        scan = _cast((self._world, moving), pose, self.lidar, noise)
+        luck = Luck.draw(self.lidar, LidarEffects(), self._random(_NOISE, frame, sensor))
+        rays = self.lidar.directions_of(frame)
+        scan = _scan((self._world, moving), pose, self.lidar, rays, luck)
         return SensorRecording(scan, pose, np.empty((0, 4)))
 
     @cached_property
