@@ -133,7 +133,7 @@ def test_boxes_of_moving_actors_are_a_table_in_the_frame_of_the_map(drive, tmp_p
     with (tmp_path / "boxes.csv").open() as file:
         rows = list(csv.DictReader(file))
     same = [
-        {name: str(value) for name, value in row.items()}
+        {name: "" if value is None else str(value) for name, value in row.items()}
         for row in json.loads((tmp_path / "boxes.json").read_text())
     ]
     assert rows == same

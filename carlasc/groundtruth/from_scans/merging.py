@@ -36,7 +36,7 @@ from carlasc.core.scans import RaysFromPlace, lengths, runs_of_origins
 from carlasc.groundtruth.options import Dynamic
 from carlasc.groundtruth.voting.ballot import ClassPoints, Observation, SeenClass
 from carlasc.motion import BODY_MARGIN_M
-from carlasc.motion.tracks import MovingActors, Track
+from carlasc.motion.tracks import MovingActors, Track, is_doubtful
 from carlasc.storage import layout
 
 STATIC = 0  # region of the voxels that belong to no actor
@@ -435,6 +435,8 @@ class Merger:
             ground = self.classes.have_role(scan.labels, "ground")
             for track in self.actors.tracks.values():
                 static[track.members.get(frame, [])] = False
+                if is_doubtful(track.confidence):  # its body may be a part of the static scene
+                    continue
                 lower, upper = track.lower - _AROUND_M, track.upper + _AROUND_M
                 least, most = track.lower - _UNDER_M, track.upper + _UNDER_M
                 corners = np.minimum(lower, least), np.maximum(upper, most)
