@@ -47,13 +47,20 @@ _INSET_M = (
 # Of a car, as fractions: the height of its body, the ends and the width of its cabin.
 _BELT, _CABIN, _CABIN_WIDE = 0.62, (0.08, 0.75), 0.85
 
-# True sizes of vehicles less those that are found, of which one face, two or more were seen: limits
-# of length, width and height, metres. Those of vehicles of a drive that are taken from five other
-# drives hold 90% of them.
+# True sizes of vehicles less those that are found, of which one face, two or more were seen, by
+# whether free space or the data show the actor: limits of length, width and height, metres. If five
+# drives give them, they hold 90% of the vehicles of a sixth one.
 _ERRORS_M = {
-    1: ((-0.68, -0.11, 0.05), (3.70, 1.05, 1.75)),
-    2: ((-0.15, -0.07, 0.05), (1.62, 0.18, 0.65)),
-    3: ((-0.09, -0.03, 0.07), (0.25, 0.08, 0.50)),
+    True: {
+        1: ((-0.61, -0.23, -0.02), (3.82, 1.10, 1.75)),
+        2: ((-1.17, -0.10, -0.06), (2.59, 0.53, 0.99)),
+        3: ((-0.16, -0.03, 0.05), (0.29, 0.08, 0.50)),
+    },
+    False: {
+        1: ((-0.69, -0.03, 0.06), (3.36, 1.01, 1.43)),
+        2: ((0.03, -0.05, 0.07), (1.52, 0.09, 0.49)),
+        3: ((-0.02, -0.04, 0.07), (0.18, 0.08, 0.47)),
+    },
 }
 
 LENGTH, WIDTH = 0, 1
@@ -110,17 +117,18 @@ class Extent:
         )
         return length, width
 
-    def interval(self, size: FloatArray) -> FloatArray:
+    def interval(self, size: FloatArray, *, found: bool) -> FloatArray:
         """Return (2, 3) metres, between which the true length, width and height of 90 in 100
         vehicles are; NaN without points or a visible face, and for actors with two wheels.
 
         Args:
             size: (3,) length, width and height that were found.
+            found: whether free space shows the actor, and not a field of the data.
         """
-        faces = min(sum(self.faces), max(_ERRORS_M))
+        faces = min(sum(self.faces), 3)
         if not faces or not self.points or size[WIDTH] < _ACTORS_WIDE_M:
             return np.full((2, 3), np.nan)
-        return size + np.array(_ERRORS_M[faces])
+        return size + np.array(_ERRORS_M[found][faces])
 
     @property
     def exemplary(self) -> bool:

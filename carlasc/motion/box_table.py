@@ -24,7 +24,6 @@ from carlasc.errors import (
     reading,
     within,
 )
-from carlasc.motion.bodies import BODY_MARGIN_M
 from carlasc.motion.tracks import Track
 from carlasc.storage.files import AnyPath, csv_text, to_json, write_output
 
@@ -116,8 +115,8 @@ class BoxTable:
                 middle = transform_points(pose, (track.lower + track.upper) / 2) * signs
                 ahead, last = pose[:3, 0] * signs, (track.confidence,)
                 heading = [np.arctan2(ahead[1], ahead[0])]
-                body = track.extent.interval(track.size - 2 * BODY_MARGIN_M).ravel()
-                own = np.concatenate([middle, track.size, heading, velocity * signs, last, body])
+                own = np.concatenate([middle, track.size, heading, velocity * signs, last])
+                own = np.append(own, track.interval())
                 rows[key] = (round(seconds, 6), key[0], names[track.label], *own.round(4))
         return cls._of([*rows.values()])
 

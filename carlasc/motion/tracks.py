@@ -126,6 +126,10 @@ class Track:
         """(3,) metres: length, width, height of the body."""
         return self.upper - self.lower
 
+    def interval(self) -> FloatArray:
+        """Return (2, 3) metres: see `Extent.interval`."""
+        return self.extent.interval(self.size - 2 * BODY_MARGIN_M, found=self.confidence < 1)
+
     @property
     def is_possible(self) -> bool:
         """Whether its body, and what was seen of it, are not too large for one actor."""

@@ -58,7 +58,7 @@ def sizes_of(
             if width is not None:  # two-wheelers have no mirrors, and few points
                 true = np.array([length, width, height])
                 size = track.size - 2 * BODY_MARGIN_M
-                yield sum(track.extent.faces), size, true, track.extent.interval(size)
+                yield sum(track.extent.faces), size, true, track.interval()
 
 
 def main() -> None:

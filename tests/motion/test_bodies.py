@@ -284,18 +284,19 @@ class TestLearnedShapes:
         assert upper[2] == pytest.approx(0.55)
 
 
-def test_an_interval_is_narrower_with_more_visible_faces():
+@pytest.mark.parametrize("found", [True, False])
+def test_an_interval_is_narrower_with_more_visible_faces(found):
     size = np.array([4.4, 1.8, 1.5])
     rows = [
-        Extent(-size / 2, size / 2, (rear, front, low, False), 100).interval(size)
+        Extent(-size / 2, size / 2, (rear, front, low, False), 100).interval(size, found=found)
         for rear, front, low in ((True, False, False), (True, False, True), (True, True, True))
     ]
     wide = [(row[1] - row[0]) for row in rows]
     assert (wide[0] > wide[1]).all() and (wide[1] > wide[2]).all()
     assert all((row[1] > size).all() for row in rows)
-    for faces, points, found in (
+    for faces, points, own in (
         ((False,) * 4, 100, size),
         ((True,) * 4, 0, size),
         ((True,) * 4, 100, size * (0.4, 0.4, 1)),
     ):
-        assert np.isnan(Extent(-size / 2, size / 2, faces, points).interval(found)).all()
+        assert np.isnan(Extent(-size / 2, size / 2, faces, points).interval(own, found=found)).all()
