@@ -123,23 +123,23 @@ class Lidar:
         Channels are ordered from the highest to the lowest. The azimuth of the rays of a channel
         increases from -pi: x towards y.
         """
-        return self._towards(0) if self.scattered else self._spinning()
-
-    def directions_of(self, scan: int) -> FloatArray:
-        """Return the (R, 3) unit vectors of the rays of a scan."""
-        return self._towards(scan) if self.scattered and scan else self.directions
-
-    @property
-    def phases(self) -> FloatArray:
-        """(R,) part of a scan's period after which each ray is cast, from 0 to 1."""
-        rays, columns = len(self.directions), self.points // self.channels
-        return np.arange(rays) / rays if self.scattered else np.arange(rays) % columns / columns
-
-    def _spinning(self) -> FloatArray:
+        if self.scattered:
+            return self._towards(0)
         even = np.linspace(self.upper_deg, self.lower_deg, self.channels)
         elevation = np.radians(self.elevations_deg or even)[:, None]
         columns = self.points // self.channels
         return _unit_vectors(elevation, np.linspace(-np.pi, np.pi, columns, endpoint=False))
+
+    def directions_of(self, scan: int) -> FloatArray:
+        """Return the (R, 3) unit vectors of the rays of a scan."""
+        return self._towards(scan) if self.scattered else self.directions
+
+    @property
+    def phases(self) -> FloatArray:
+        """(R,) part of a scan's period after which each ray is cast, from 0 to 1."""
+        rays = len(self.directions)
+        period = rays if self.scattered else self.points // self.channels
+        return np.arange(rays) % period / period
 
     def _towards(self, scan: int) -> FloatArray:
         """Return the directions of the part of an additive sequence that belongs to a scan."""
@@ -154,6 +154,9 @@ _R2 = (0.7548776662466927, 0.5698402909980532)
 
 
 def _unit_vectors(elevation: AnyFloatArray, azimuth: AnyFloatArray) -> FloatArray:
+    """Return the (R, 3) unit vectors of elevations and azimuths, radians, of shapes that broadcast
+    to each other.
+    """
     rays = (
         np.cos(elevation) * np.cos(azimuth),
         np.cos(elevation) * np.sin(azimuth),
@@ -163,6 +166,7 @@ def _unit_vectors(elevation: AnyFloatArray, azimuth: AnyFloatArray) -> FloatArra
 
 
 def _steps(first: float, last: float, count: int) -> tuple[float, ...]:
+    """Return values at equal distances, the last one included."""
     return tuple(np.linspace(first, last, count).tolist())
 
 

@@ -113,10 +113,9 @@ class BoxTable:
                     continue
                 pose, velocity = table_T_world @ pose, rotate_vectors(table_T_world, velocity)
                 middle = transform_points(pose, (track.lower + track.upper) / 2) * signs
-                ahead, last = pose[:3, 0] * signs, (track.confidence,)
+                ahead, last = pose[:3, 0] * signs, [track.confidence, *track.interval().flat]
                 heading = [np.arctan2(ahead[1], ahead[0])]
                 own = np.concatenate([middle, track.size, heading, velocity * signs, last])
-                own = np.append(own, track.interval())
                 rows[key] = (round(seconds, 6), key[0], names[track.label], *own.round(4))
         return cls._of([*rows.values()])
 

@@ -439,8 +439,9 @@ class Merger:
                     continue
                 lower, upper = track.lower - _AROUND_M, track.upper + _AROUND_M
                 least, most = track.lower - _UNDER_M, track.upper + _UNDER_M
-                corners = np.minimum(lower, least), np.maximum(upper, most)
-                for rays, actor_T_place, crossing in scan.through(track, *corners):
+                for rays, actor_T_place, crossing in scan.through(
+                    track, np.minimum(lower, least), np.maximum(upper, most)
+                ):
                     body = transform_points(actor_T_place, rays.points[crossing])
                     near = rays.part.start + crossing
                     inside = ((body >= lower) & (body <= upper)).all(axis=1) & ~ground[near]
