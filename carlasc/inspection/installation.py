@@ -310,11 +310,17 @@ def _look_at_compiled_code() -> CompiledCode:
     folder = Path(loop.stats.cache_path)
     kept = cache_folder() if folder.is_relative_to(cache_folder()) else _PACKAGE
     root = kept if folder.name == "__pycache__" else folder.parent
-    sizes = [path.stat().st_size for path in root.rglob("*.nb[ic]")]
+    sizes = [*_sizes_in(root)]
     nearest = next(parent for parent in (folder, *folder.parents) if parent.exists())
     return CompiledCode(
         without_names(str(root)), os.access(nearest, os.W_OK), len(sizes), sum(sizes), compile_s
     )
+
+
+def _sizes_in(root: Path) -> Iterator[int]:
+    for path in root.rglob("*.nb[ic]"):
+        with suppress(FileNotFoundError):  # other processes replace their files
+            yield path.stat().st_size
 
 
 def _next(number: int) -> int:

@@ -130,6 +130,12 @@ def test_a_package_that_is_only_on_the_path_says_so(monkeypatch):
     assert not found.ok and "on the path, but not installed" in found.problems[0]
 
 
+def test_compiled_code_that_another_process_replaces_is_no_problem(tmp_path):
+    (tmp_path / "a.nbi").write_bytes(b"123")
+    (tmp_path / "b.nbc").symlink_to(tmp_path / "gone")
+    assert list(installation._sizes_in(tmp_path)) == [3]
+
+
 def test_no_name_of_a_user_is_printed(monkeypatch, tmp_path):
     home = tmp_path / "homes" / "jdoe"
     (home / "cache").mkdir(parents=True)
