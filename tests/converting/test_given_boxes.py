@@ -182,7 +182,14 @@ def test_a_bag_gets_the_boxes_of_a_table(tmp_path):
         ahead = first.sensor_T_box[:, :2, 0]
         for row, track in enumerate(first.tracks.tolist()):
             heading = np.arctan2(ahead[row, 1], ahead[row, 0])
-            values = [*first.centers[row], *first.sizes[row], heading, *[np.nan] * 3, 1]
+            values = [
+                *first.centers[row],
+                *first.sizes[row],
+                heading,
+                *[np.nan] * 3,
+                1,
+                *[np.nan] * 6,
+            ]
             rows.append((seconds - drive.times[0], track, values))
     times, numbers, values = zip(*rows, strict=True)
     names = ("Vehicle",) * len(rows)

@@ -39,9 +39,10 @@ def assert_same(one, other):
     np.testing.assert_array_equal(one.grid.labels, other.grid.labels)
     np.testing.assert_array_equal(one.grid.counts, other.grid.counts)
     np.testing.assert_array_equal(one.votes.to_sparse(), other.votes.to_sparse())
+    np.testing.assert_array_equal(one.flags, other.flags)
     assert (one.evidence is None) == (other.evidence is None)
     if one.evidence is not None:
-        for name in ("occupied", "classes", "flags", "views"):
+        for name in ("occupied", "classes", "views"):
             np.testing.assert_array_equal(
                 getattr(one.evidence, name), getattr(other.evidence, name)
             )

@@ -41,6 +41,7 @@ from faults.targets import TARGETS, Target
 CASE_S = 10.0  # fact: fault-case
 """Seconds that a case may take before it counts as a fault."""
 HANG_S = 30.0
+WRITE_S = 300.0  # for valid files, whose loops may have to be compiled first
 """Seconds without progress after which a child is ended."""
 MEMORY = 1 << 30
 """Bytes of address space that reading a case may take beyond what reading the whole files took."""
@@ -189,7 +190,7 @@ def run_target(target: Target, cases: range, seed: int, folder: Path) -> tuple[i
     found = place / _FOUND
     place.mkdir(parents=True, exist_ok=True)
     found.touch()
-    if status := _in_child(lambda: target.write(place / "valid"), progress):
+    if status := _in_child(lambda: target.write(place / "valid"), progress, WRITE_S):
         return 0, [f"{target.name}: its valid files cannot be written: {status}"]
     start = cases.start
     while start < cases.stop:
@@ -208,8 +209,11 @@ def run_target(target: Target, cases: range, seed: int, folder: Path) -> tuple[i
     return len(cases), _distinct(lines)
 
 
-def _in_child(work: Callable[[], None], progress: Progress) -> str:
-    """Run a function in a forked process; return "" if it ended well, otherwise how it died."""
+def _in_child(work: Callable[[], None], progress: Progress, limit_s: float = HANG_S) -> str:
+    """Run a function in a forked process; return "" if it ended well, otherwise how it died.
+
+    `limit_s` is the longest time without progress.
+    """
     progress.reach(progress.case)
     child = os.fork()
     if child == 0:
@@ -228,13 +232,13 @@ def _in_child(work: Callable[[], None], progress: Progress) -> str:
         ended, status = os.waitpid(child, os.WNOHANG)
         if ended:
             break
-        if progress.seconds > CASE_S + HANG_S:
+        if progress.seconds > CASE_S + limit_s:
             hung = True
             os.kill(child, signal.SIGKILL)
         time.sleep(wait)
         wait = min(0.2, wait * 2)
     if hung:
-        return f"hangs: no progress in {HANG_S:.0f} s"
+        return f"hangs: no progress in {limit_s:.0f} s"
     if os.WIFSIGNALED(status):
         return f"kills the process: {signal.Signals(os.WTERMSIG(status)).name}"
     return f"{_UNREADABLE}: exit status {os.WEXITSTATUS(status)}" if os.WEXITSTATUS(status) else ""
