@@ -62,7 +62,7 @@ def test_the_study_of_a_real_drive_runs_in_miniature(real: Path, tmp_path: Path)
     printed = run_on_the_real_drive("real", real, tmp_path)
     moving = dict(re.findall(r"\| track (\d) \| \d+ \| ([\d.]+)%", printed))
     assert float(moving["1"]) > 90 and float(moving["2"]) > 90 and float(moving["4"]) < 5
-    of_movers, kept = re.findall(r"([\d.]+)%", re.findall(r"\| bag .*", printed)[0])[1::4]
+    of_movers, kept = re.findall(r"([\d.]+)%", re.findall(r"\| bag, .*", printed)[0])[1::4]
     assert float(of_movers) < 1 and float(kept) > 99  # the cyclist, and structure
 
 

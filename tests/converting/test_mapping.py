@@ -167,8 +167,9 @@ def test_what_would_be_read_again_is_refused(recording, tmp_path):
 
 
 ENDS_ITSELF = """
-import fnmatch, os, sys
+import fnmatch, os, signal, sys
 from carlasc.cli import main
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored below a shell's job
 pattern, number, ending, *sys.argv[1:] = sys.argv[1:]
 left = int(number)
 
