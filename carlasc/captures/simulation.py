@@ -88,6 +88,8 @@ class Simulator(Capture, ABC):
         self._frames, self._sensors = range(first_frame, first_frame + count), sensors
         self.seed, self.traffic, self.lidar, self.bev = seed, traffic, lidar or Lidar(), bev
         self.cameras = {camera.name: camera for camera in self.make_cameras(cameras)}
+        if effects != LidarEffects() and type(self).read_scan is Capture.read_scan:
+            raise ArgumentError("effects", expected="none: its scans are ideal", found=str(effects))
         self.effects = effects
 
     @abstractmethod

@@ -66,7 +66,9 @@ def simulate(
         return
     spec = grid.spec_or_published()
     recorder = carlasc.captures.load_recorder(simulator, carlasc.captures.Simulator)
-    simulated = recorder(**drive, effects=effects.make())
+    if effects.is_given:
+        drive["effects"] = effects.make()
+    simulated = recorder(**drive)
     with run.spread("simulate") as spread:
         made = carlasc.regrid(simulated, spec, out, run=spread)
     print_frames(made, made.grids, f"{made.spec}: made", json=json)

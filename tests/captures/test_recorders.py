@@ -9,10 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from carlasc_recorders import SimulatedCapture
+from helpers.errors import raises
 from typer.testing import CliRunner
 
 import carlasc
-from carlasc.captures import Capture, Simulator, load_recorder, recorder_names, simulate
+from carlasc.captures import (
+    Capture,
+    LidarEffects,
+    Simulator,
+    load_recorder,
+    recorder_names,
+    simulate,
+)
 from carlasc.cli import app
 from carlasc.core import CARLA
 from carlasc.errors import ArgumentError, ConflictError, DependencyError
@@ -63,6 +71,12 @@ def test_a_third_partys_simulator_writes_a_capture_and_goes_on(installed, tmp_pa
     with pytest.raises(ConflictError) as error:
         simulate(out, count=3, sensors=2, run=ONE)
     assert "simulator 'straight'" in error.value.found
+
+
+def test_a_simulator_whose_scans_are_ideal_takes_no_effects(installed):
+    load_recorder("straight")(count=1, sensors=2, effects=LidarEffects())
+    with raises(ArgumentError, where="effects", found="rain=0.1"):
+        load_recorder("straight")(count=1, sensors=2, effects=LidarEffects(rain=0.1))
 
 
 def test_the_command_takes_its_name_for_a_capture_and_for_ground_truth(
