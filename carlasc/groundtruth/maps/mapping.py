@@ -49,7 +49,7 @@ from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.files import temporary_folder, to_json, write_atomic, writing_folder
-from carlasc.storage.protocol import SequenceWriter, Source
+from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 
 
 class MapContent(NamedTuple):
@@ -128,11 +128,7 @@ class DriveMap:
         plan = GridPlan(GridSpec.published(), "map", options, Voting(), frames)
         found = scan_sequences(source, plan, options)
         having = [one.sequence for one in found if isinstance(one, ScanSequence)]
-        sequence = only(
-            "source",
-            {one.path or one.location: one for one in having},
-            "one sequence, as a map has one frame",
-        )
+        sequence = _only(having)
         known = sequence.frames("points")
         chosen = choose_frames(frames, known, sequence.location)
         near = with_neighbours(FrameRange(chosen[0], chosen[-1] + 1))
@@ -351,11 +347,7 @@ def write_grid(source: Source, name: str, frames: FrameRange, files: MapFiles) -
         raise MissingDataError(
             source.location, expected=f"the grid {name}", found=", ".join(names) or "no grid"
         )
-    sequence = only(
-        "source",
-        {one.path or one.location: one for one in having},
-        "one sequence, as a map has one frame",
-    )
+    sequence = _only(having)
     where = f"{sequence.location}/{name}"
     chosen = choose_frames(frames, sequence.frames(f"{name}/labels"), where)
     if len(chosen) > 1:
@@ -394,4 +386,12 @@ def with_neighbours(frames: FrameRange) -> FrameRange:
     start, stop = frames.start, frames.stop
     return FrameRange(
         None if start is None else max(start - around, 0), None if stop is None else stop + around
+    )
+
+
+def _only(having: list[Sequence]) -> Sequence:
+    return only(
+        "source",
+        {one.path or one.location: one for one in having},
+        "one sequence, as a map has one frame",
     )
