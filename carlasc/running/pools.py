@@ -25,7 +25,7 @@ DEATHS = 3
 """Number of deaths of worker processes after which a task is not tried again."""
 
 _TERMINATED = 128 + signal.SIGTERM
-_GRACE_S = 3.0  # time for a worker to remove its unfinished file
+_GRACE_S = 10.0  # for a worker to remove its unfinished files, after the disk has synced them
 
 
 class LostTaskError(CarlascError):

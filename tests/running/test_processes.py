@@ -125,14 +125,19 @@ def test_workers_that_cannot_start_are_one_clear_line(tmp_path: Path):
     assert lines[0].startswith("CarlascError: worker processes die as soon as they start: ")
 
 
-def test_stopping_in_the_middle_ends_the_workers_at_once_and_leaves_no_half_file(tmp_path: Path):
+@pytest.mark.parametrize(
+    "job",
+    [
+        jobs.write_for_a_minute,
+        pytest.param(jobs.write_on_a_slow_disk, marks=pytest.mark.slow),
+    ],
+)
+def test_stopping_in_the_middle_ends_the_workers_at_once_and_leaves_no_half_file(job, tmp_path):
     slow = [tmp_path / "a.bin", tmp_path / "b.bin"]
     started = time.monotonic()
     with (
         pytest.raises(KeyboardInterrupt),
-        closing(
-            run_all(jobs.write_for_a_minute, [Path("nothing"), *slow], run=Run(workers=2))
-        ) as results,
+        closing(run_all(job, [Path("nothing"), *slow], run=Run(workers=2))) as results,
     ):
         next(results)
         while not all(path.with_suffix(".begun").exists() for path in slow):

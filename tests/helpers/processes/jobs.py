@@ -56,6 +56,20 @@ def write_for_a_minute(path: Path) -> None:
         write_atomic(path, write_slowly)
 
 
+def write_on_a_slow_disk(path: Path) -> None:
+    """Write a file whose last bytes take four seconds, in which the system holds signals back."""
+
+    def sync_slowly(file: object) -> None:
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+        write_atomic(path.with_suffix(".begun"), str(os.getpid()).encode())
+        time.sleep(4)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+        time.sleep(60)
+
+    if path.suffix:
+        write_atomic(path, sync_slowly)
+
+
 def write_in_two_workers(paths: list[Path]) -> None:
     list(run_all(write_for_a_minute, paths, run=Run(workers=2)))
 
