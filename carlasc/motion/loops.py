@@ -49,7 +49,7 @@ _GATES_M = (1.0, 1.0, 1.0, 0.7, 0.7, 0.5, 0.5, 0.35, 0.35, 0.25, 0.25, 0.2, 0.2,
 _ALIKE, _SIDEWAYS_M = 0.9, 1.5  # cosine between normals, and distance along planes
 _UPRIGHT, _LEVEL = 0.5, 0.8  # |z| of the normals of walls, and of ground
 _INSIDE_M, _SAME_M = 22.0, 0.15
-_SHARE, _AMBIGUOUS, _OTHER_M = 0.45, 0.85, 0.5
+_SHARE, _AMBIGUOUS, _LOOSE, _OTHER_M = 0.45, 0.85, 0.25, 0.5
 _DETERMINED, _FEWEST, _ROUGH_M = 0.02, 12.0, 0.06
 # Errors of a motion over a submap, and of a loop, metres and radians.
 _UNKNOWNS = 200  # most loops that count, and most submaps without loops whose poses are unknown
@@ -119,11 +119,13 @@ class Loop(NamedTuple):
         first: number of the earlier submap.
         second: number of the later one.
         motion: (4, 4) first_T_second.
+        held: number of common planes across the direction that fewest of them hold.
     """
 
     first: int
     second: int
     motion: Transform
+    held: float
 
 
 class Submaps:
@@ -211,7 +213,7 @@ def close_loops(submaps: Sequence[Submap], poses: FloatArray) -> tuple[FloatArra
     at = np.clip(np.arange(len(poses), dtype=np.float64), rows[0], rows[-1])
     moved = multiply(slerp(solved, rows, at), invert(slerp(start, rows, at)), poses)
     found = []
-    for first, second, _ in loops:
+    for first, second, *_ in loops:
         one, other = chosen[first], chosen[second]
         now = multiply(invert(solved[first]), solved[second])
         was = multiply(invert(start[first]), start[second])
@@ -269,15 +271,26 @@ def _lay(submaps: Sequence[Submap], first: int, second: int) -> Iterator[Loop]:
         return
     best, motion = max(fits, key=lambda fit: fit[0])
     off = motion[:3, 3] - given[:3, 3]
+    spread = _spread(one.planes, other.planes, motion)
+    values, axes = principal_axes(spread[None])
+    weakest = axes[0, :, 0]
     rivals = [
-        common
+        where
         for common, where in fits
         if np.square(where[:3, 3] - motion[:3, 3]).sum() > _OTHER_M**2
+        and common > _AMBIGUOUS * best
     ]
-    alone = best > _SHARE and max(rivals, default=0.0) < _AMBIGUOUS * best
+    # along a street, all positions have its walls in common: what stands across it decides
+    alone = best > _SHARE and all(
+        weakest @ _spread(one.planes, other.planes, rival) @ weakest < _LOOSE * values[0, 0]
+        for rival in rivals
+    )
     possible = np.hypot(off[0], off[1]) < window and abs(off[2]) < height
-    if alone and possible and _is_determined(one.planes, other.planes, motion):
-        yield Loop(first, second, motion)
+    held = values[0, 0] > _DETERMINED * values.sum()
+    near = _matches(one.planes, other.planes, motion, _SAME_M)
+    smooth = len(near[0]) and _apart(one.planes, other.planes, motion, *near) < _ROUGH_M
+    if alone and possible and held and smooth:
+        yield Loop(first, second, motion, float(values[0, 0]))
 
 
 def _positions(
@@ -402,18 +415,16 @@ def _common(one: SubmapPlanes, other: SubmapPlanes, motion: Transform) -> float:
     return min(shares)
 
 
-def _is_determined(one: SubmapPlanes, other: SubmapPlanes, motion: Transform) -> bool:
-    """Return whether the common planes of two submaps are near, and hold every direction."""
-    a, b = _matches(one, other, motion, _SAME_M)
-    normals = one.normals[a]
-    spread = (normals[:, :, None] * normals[:, None, :]).sum(axis=0)
-    values = principal_axes(spread[None])[0][0]
-    least = max(_FEWEST, _DETERMINED * float(values.sum()))
-    return bool(values[0] > least) and _apart(one, other, motion, a, b) < _ROUGH_M
+def _spread(one: SubmapPlanes, other: SubmapPlanes, motion: Transform) -> FloatArray:
+    """Return how many of the common planes of two submaps lie across each direction: (3, 3)."""
+    normals = one.normals[_matches(one, other, motion, _SAME_M)[0]]
+    return np.asarray((normals[:, :, None] * normals[:, None, :]).sum(axis=0))
 
 
 def _agreeing(submaps: Sequence[Submap], loops: list[Loop]) -> list[Loop]:
-    """Return the loops that most of the loops near them agree with, at least one."""
+    """Return the loops that most of the loops near them agree with, at least one, if together they
+    have enough planes across every direction.
+    """
     chosen = []
     offs = [
         small_motions(loop.motion[None])[0]
@@ -421,7 +432,7 @@ def _agreeing(submaps: Sequence[Submap], loops: list[Loop]) -> list[Loop]:
         for loop in loops
     ]
     for loop, off in zip(loops, offs, strict=True):
-        votes = []
+        near, agreeing = 0, list[float]()
         for other, theirs in zip(loops, offs, strict=True):
             apart = sum(
                 abs(submaps[x].along_m - submaps[y].along_m)
@@ -430,8 +441,10 @@ def _agreeing(submaps: Sequence[Submap], loops: list[Loop]) -> list[Loop]:
             if other is not loop and apart < _TOGETHER_M:
                 away = float(np.sqrt(np.square(off[:3] - theirs[:3]).sum()))
                 turned = float(np.abs(off[3:] - theirs[3:]).max())
-                votes.append(away < _AGREE_M + _DRIFT * apart and turned < _AGREE_RAD)
-        if any(votes) and 2 * sum(votes) > len(votes):
+                near += 1
+                if away < _AGREE_M + _DRIFT * apart and turned < _AGREE_RAD:
+                    agreeing.append(other.held)
+        if 2 * len(agreeing) > near and loop.held + sum(agreeing) > _FEWEST:
             chosen.append(loop)
     return chosen
 
@@ -455,12 +468,12 @@ def _solve(
         for _ in range(3):
             matrix, right = np.zeros((6 * len(start),) * 2), np.zeros(6 * len(start))
             matrix[np.arange(6), np.arange(6)] = 1e12  # the first pose stays
-            for (i, j, motion), error in [*steps, *((loop, _LOOP) for loop in loops)]:
+            for (i, j, motion), error in [*steps, *((loop[:3], _LOOP) for loop in loops)]:
                 _add(matrix, right, solved, i, j, motion, error)
             move(solved, solve_positive(matrix, right).reshape(-1, 6), 0)
         left = [
             np.abs(small_motions(multiply(invert(solved[i]), solved[j], invert(motion))[None])[0])
-            for i, j, motion in loops
+            for i, j, motion, _ in loops
         ]
         limits = np.repeat([_AGREE_M, _AGREE_RAD], 3)
         off = [float((one / limits).max()) for one in left]
