@@ -301,9 +301,7 @@ def _check(cloud: Cloud, rig: Rig, where: str) -> None:
         found = f"{cloud.points.shape} {cloud.points.dtype}"
         raise FormatError(f"{where}: points", expected="shape (N, 4) float32", found=found)
     if not 0 <= cloud.sensor < len(rig.sensors):
-        raise FormatError(
-            where, expected=f"a sensor 0..{len(rig.sensors) - 1}", found=str(cloud.sensor)
-        )
+        raise FormatError(where, expected=f"a sensor 0..{len(rig.sensors) - 1}", found=cloud.sensor)
     fields = {
         "labels": cloud.labels,
         "instances": cloud.instances,
@@ -315,7 +313,7 @@ def _check(cloud: Cloud, rig: Rig, where: str) -> None:
             raise FormatError(
                 f"{where}: {name}",
                 expected=f"one for each of {count} points",
-                found=str(len(values)),
+                found=len(values),
             )
     if cloud.seconds is not None and not np.isfinite(cloud.seconds).all():
         found = f"NaN or infinity at point {int(np.argmin(np.isfinite(cloud.seconds)))}"

@@ -309,7 +309,7 @@ def examine(
             "frames",
             expected=f"frames of {recording.location}: {recording.frames[0].number} to "
             f"{recording.frames[-1].number}",
-            found=str(frames),
+            found=frames,
         )
     if trajectory is not None and trajectory.seconds is not None:
         numbers = np.array([handle.number for handle in chosen])
@@ -584,7 +584,7 @@ def begin(plan: RecordingPlan, target: AxesAndClasses, metadata: Metadata) -> No
         raise ConflictError(
             where,
             expected=f"poses from {plan.pose_source}",
-            found=str(before.extra.get("poses", "others")),
+            found=before.extra.get("poses", "others"),
             advice="write to another place",
         )
     if before is not None and _places(before.extra) not in ([], _places(extra)):

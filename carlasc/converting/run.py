@@ -476,7 +476,7 @@ def check_arguments(source: Path, sink: Sink, split: str, grids: Grids) -> None:
             raise ArgumentError(
                 "observe",
                 expected="FromScans(...), because scans are converted",
-                found=str(grids.observe),
+                found=grids.observe,
             )
         if not sink.is_readable:
             raise ArgumentError(

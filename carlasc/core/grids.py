@@ -75,7 +75,7 @@ class GridSpec:
             values = tuple(map(kind, given)) if all(map(is_finite, given)) else ()
             if len(values) != 3:
                 raise ArgumentError(
-                    f"grid {name}", expected="three finite numbers", found=str(getattr(self, name))
+                    f"grid {name}", expected="three finite numbers", found=getattr(self, name)
                 )
             object.__setattr__(self, name, values)
         if math.prod(self.size) >= 2**31:
@@ -104,7 +104,7 @@ class GridSpec:
             ),
         ):
             if wrong:
-                raise ArgumentError(f"grid {name}", expected=expected, found=str(found))
+                raise ArgumentError(f"grid {name}", expected=expected, found=found)
 
     @classmethod
     def published(cls, name: Preset | Coordinates = "coarse") -> GridSpec:
@@ -154,7 +154,7 @@ class GridSpec:
         try:
             size = [float(v) for v in params["grid_size"]]
             if any(v != int(v) for v in size):
-                raise FormatError(where, expected="integers in grid_size", found=str(size))
+                raise FormatError(where, expected="integers in grid_size", found=size)
             lower, upper = _three(params["min_bound"]), _three(params["max_bound"])
             return cls(params["coordinates"], _three(map(int, size)), lower, upper)
         except FormatError:
@@ -394,7 +394,7 @@ class Grid:
         for name, array in (("labels", self.labels), ("counts", self.counts)):
             if array is not None and array.shape != self.spec.size:
                 raise FormatError(
-                    f"grid {name}", expected=f"shape {self.spec.size}", found=str(array.shape)
+                    f"grid {name}", expected=f"shape {self.spec.size}", found=array.shape
                 )
 
     @property

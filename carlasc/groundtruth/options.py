@@ -79,10 +79,10 @@ class FromScans:
                 found=f"{first}:{last}",
             )
         if self.stride < 1:
-            raise ArgumentError("stride", expected="at least 1", found=str(self.stride))
+            raise ArgumentError("stride", expected="at least 1", found=self.stride)
         if self.window_m is not None and not self.window_m > 0:
             raise ArgumentError(
-                "window_m", expected="a positive number of metres", found=str(self.window_m)
+                "window_m", expected="a positive number of metres", found=self.window_m
             )
         check_choice("dynamic", self.dynamic, Dynamic)
         check_choice("complete", self.complete, Complete)
@@ -167,7 +167,7 @@ class Voting:
             raise ArgumentError(
                 "min_confidence",
                 expected="a probability from 0 to below 1",
-                found=str(self.min_confidence),
+                found=self.min_confidence,
             )
 
 

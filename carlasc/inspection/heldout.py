@@ -164,7 +164,7 @@ def holdout(
     existing, made = _existing_grid(as_source(source))
     spec, observe = spec or existing, observe or made
     if every < 2:
-        raise ArgumentError("every", expected="2 or more", found=str(every))
+        raise ArgumentError("every", expected="2 or more", found=every)
     if spec.coordinates != "cartesian":
         raise ArgumentError(
             "grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates

@@ -73,7 +73,7 @@ def cast_rays(
     _check_cartesian(spec)
     if grids.ndim != 4 or grids.shape[1:] != spec.size:
         raise ArgumentError(
-            "grids", expected=f"shape (G, {', '.join(map(str, spec.size))})", found=str(grids.shape)
+            "grids", expected=f"shape (G, {', '.join(map(str, spec.size))})", found=grids.shape
         )
     starts, lower, voxel = (
         np.asarray(origins, np.float64).reshape(-1, 3),
@@ -85,7 +85,7 @@ def cast_rays(
     for bit, grid in enumerate(grids):
         solid |= (grid != free).astype(np.uint8) << np.uint8(bit)
     if len(grids) > 8:
-        raise ArgumentError("grids", expected="at most 8 grids", found=str(len(grids)))
+        raise ArgumentError("grids", expected="at most 8 grids", found=len(grids))
     voxels = np.full((len(grids), len(starts) * len(steps)), -1, np.int64)
     depth = np.zeros(voxels.shape)
     _cast(

@@ -69,13 +69,13 @@ class ConfusionMatrix(Summed):
                 another shape.
         """
         if num_classes < 1:
-            raise ArgumentError("num_classes", expected="1 or more", found=str(num_classes))
+            raise ArgumentError("num_classes", expected="1 or more", found=num_classes)
         check_free(free, num_classes)
         if counts is not None and np.shape(counts) != (num_classes, num_classes):
             raise ArgumentError(
                 "counts",
                 expected=f"the shape {(num_classes, num_classes)}",
-                found=str(np.shape(counts)),
+                found=np.shape(counts),
             )
         self.num_classes = num_classes
         self.free = free
@@ -105,7 +105,7 @@ class ConfusionMatrix(Summed):
                 raise FormatError(
                     name,
                     expected=f"the shape of the ground truth {tuple(np.shape(truth))}",
-                    found=str(tuple(np.shape(array))),
+                    found=tuple(np.shape(array)),
                 )
         device = device_of(prediction, truth, mask)
         if device is None:  # torch tensors on the CPU convert to NumPy without a copy
@@ -234,7 +234,7 @@ class ConfusionMatrix(Summed):
 def check_free(free: int, num_classes: int) -> None:
     """Raise ArgumentError if the id of free space is not in 0..K-1."""
     if not 0 <= free < num_classes:
-        raise ArgumentError("free", expected=f"a class id in 0..{num_classes - 1}", found=str(free))
+        raise ArgumentError("free", expected=f"a class id in 0..{num_classes - 1}", found=free)
 
 
 def ratio(numerator: Any, denominator: Any) -> FloatArray:
@@ -350,7 +350,7 @@ def count_arrays(
     """
     for name, labels in (("prediction", prediction), ("truth", truth)):
         if labels.dtype.kind not in "uib":
-            raise FormatError(name, expected="integer class ids", found=str(labels.dtype))
+            raise FormatError(name, expected="integer class ids", found=labels.dtype)
     prediction, truth = (np.ascontiguousarray(labels).reshape(-1) for labels in (prediction, truth))
     counted = (
         np.ones(prediction.shape, np.bool_)

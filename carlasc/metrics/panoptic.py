@@ -122,7 +122,7 @@ class PanopticQuality(Summed):
             raise ArgumentError(
                 "things",
                 expected=f"class ids below {num_classes} other than free",
-                found=str(sorted(things)),
+                found=sorted(things),
             )
         self.num_classes, self.things = num_classes, frozenset(things)
         self.free, self.variant = free, variant

@@ -183,7 +183,7 @@ class RayIoU(Summed):
     def _check(self, labels: ArrayLike, name: str, spec: GridSpec) -> AnyArray:
         array = to_numpy(labels)
         if array.shape != spec.size:
-            raise FormatError(name, expected=f"shape {spec.size}", found=str(array.shape))
+            raise FormatError(name, expected=f"shape {spec.size}", found=array.shape)
         check_ids(name, array, self.num_classes)
         return array.astype(np.uint16, copy=False)
 

@@ -530,7 +530,7 @@ def _check_number(sequences: int) -> None:
         raise ArgumentError(
             "sequences",
             expected=f"at least {_FEWEST_SEQUENCES} sequences",
-            found=str(sequences),
+            found=sequences,
         )
 
 

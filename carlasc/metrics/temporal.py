@@ -90,7 +90,7 @@ class Consistency(Summed):
             raise FormatError(
                 "later",
                 expected=f"the geometry of the earlier frame, {earlier.spec}",
-                found=str(later.spec),
+                found=later.spec,
             )
         before = moved_grid(earlier, later_T_earlier)
         movable = sorted(self.moving)
@@ -131,7 +131,7 @@ def shape_consistency(earlier: BoolArray, later: BoolArray) -> float:
         FormatError: shapes differ.
     """
     if earlier.shape != later.shape:
-        raise FormatError("later", expected=f"shape {earlier.shape}", found=str(later.shape))
+        raise FormatError("later", expected=f"shape {earlier.shape}", found=later.shape)
     union = int(np.count_nonzero(earlier | later))
     return np.count_nonzero(earlier & later) / union if union else float("nan")
 

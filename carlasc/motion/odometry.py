@@ -387,7 +387,7 @@ def _usable(
             raise ArgumentError(
                 "seconds",
                 expected=f"{len(points)} of scan {number}, one per point",
-                found=str(len(own)),
+                found=len(own),
             )
         used = usable_points(points)
         yield points[used, :3], None if own is None else np.asarray(own)[used]

@@ -79,9 +79,7 @@ class Part:
 
     def __post_init__(self) -> None:
         if not 1 <= self.number <= self.count:
-            raise ArgumentError(
-                "part", expected="I/N with I from 1 to N, such as 2/4", found=str(self)
-            )
+            raise ArgumentError("part", expected="I/N with I from 1 to N, such as 2/4", found=self)
 
     @classmethod
     def parse(cls, text: str) -> Self:
@@ -178,7 +176,7 @@ class Run:
     def __post_init__(self) -> None:
         check_types(Run, vars(self))
         if self.workers is not None and self.workers < 1:
-            raise ArgumentError("workers", expected="at least 1", found=str(self.workers))
+            raise ArgumentError("workers", expected="at least 1", found=self.workers)
 
     @property
     def processes(self) -> int:

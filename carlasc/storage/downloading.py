@@ -186,7 +186,7 @@ def download(
     check_types(download, locals())
     began = time.perf_counter()
     if connections < 1:
-        raise ArgumentError("connections", expected="1 or more", found=str(connections))
+        raise ArgumentError("connections", expected="1 or more", found=connections)
     if keep and not extract:
         raise ArgumentError(
             "keep",

@@ -173,11 +173,9 @@ class Field:
             raise FormatError(where, expected=f"shape (N, {self.columns})", found=f"{array.shape}")
         dtype = np.dtype(self.dtype)
         if dtype.kind == "u" and array.dtype.kind not in "ub":
-            raise FormatError(where, expected="unsigned integers", found=str(array.dtype))
+            raise FormatError(where, expected="unsigned integers", found=array.dtype)
         if dtype.kind == "u" and array.dtype.itemsize > dtype.itemsize:
-            raise FormatError(
-                where, expected=f"{dtype.name} or a smaller type", found=str(array.dtype)
-            )
+            raise FormatError(where, expected=f"{dtype.name} or a smaller type", found=array.dtype)
 
 
 def _decode_npz(
@@ -218,7 +216,7 @@ def check_velocity(velocity: AnyArray, count: int, where: str) -> None:
     """
     voxel = velocity["voxel"]
     if len(outside := voxel[(voxel < 0) | (voxel >= count)]):
-        raise FormatError(where, expected=f"voxels 0 to {count - 1}", found=str(outside[0]))
+        raise FormatError(where, expected=f"voxels 0 to {count - 1}", found=outside[0])
     if not np.isfinite(velocity["velocity"]).all():
         raise FormatError(where, expected="finite velocities", found="NaN or infinity")
 

@@ -127,7 +127,7 @@ def pack(
         raise ArgumentError(
             "part" if run.executor is None else "executor",
             expected="a .zarr store, which several processes can write",
-            found=str(out),
+            found=out,
         )
     source = as_source(source)
     refuse_overlap(out, source)

@@ -162,14 +162,14 @@ def view(
     if ending not in ("", *PAGES, *RECORDINGS):
         endings = ", ".join((PAGES[0], *RECORDINGS))
         expected = f"a name that ends in {endings}, or without an ending for a folder"
-        raise ArgumentError("out", expected=expected, found=str(out))
+        raise ArgumentError("out", expected=expected, found=out)
     compared, page = beside is not None or beside_grid is not None, target and not recorded
     for name, given, fits, expected in (
         ("beside", compared, page, "a page, .html or a folder"),
         ("full_points", full_points, recorded, "a recording, .rrd or .mcap"),
     ):
         if given and not fits:
-            raise ArgumentError(name, expected=expected, found=str(out or "a window"))
+            raise ArgumentError(name, expected=expected, found=out or "a window")
     if target is None:
         show_window(scene.open(), report)
         return None
@@ -178,7 +178,7 @@ def view(
     else:
         check_folder(target, overwrite)
     if not recorded and not 0.01 <= thin_m <= 10:
-        raise ArgumentError("thin_m", expected="0.01 to 10 metres", found=str(thin_m))
+        raise ArgumentError("thin_m", expected="0.01 to 10 metres", found=thin_m)
     content = open_content(scene, thin_m, beside, beside_grid)
     frames, notes = content.frames, content.reader.notes
     if ending and scene.frames is None and len(frames) > MAX_FRAMES:

@@ -100,7 +100,7 @@ class MapFiles:
                 raise ArgumentError(
                     name,
                     expected=f"a file that ends in {', '.join(_ENDINGS[name])}",
-                    found=str(path),
+                    found=path,
                 )
         if not paths:
             raise ArgumentError(
@@ -128,7 +128,7 @@ class MapFiles:
             raise ArgumentError(
                 "actors",
                 expected="a file of points of a drive in `out`",
-                found=str(grid or paths.get("out")),
+                found=grid or paths.get("out"),
             )
         folder = paths["out"].with_name(f"{paths['out'].stem}_actors") if actors else None
         out, mesh, far, trajectory, boxes = (paths.get(name) for name in _ENDINGS)

@@ -79,10 +79,10 @@ class Observation:
             raise FormatError("observation points", expected="shape (N, 3) float32", found=found)
         if self.labels.shape != (len(self.points),):
             expected = f"shape ({len(self.points)},), one per point"
-            raise FormatError("observation labels", expected=expected, found=str(self.labels.shape))
+            raise FormatError("observation labels", expected=expected, found=self.labels.shape)
         if self.labels.dtype.kind != "u":
             raise FormatError(
-                "observation labels", expected="unsigned integers", found=str(self.labels.dtype)
+                "observation labels", expected="unsigned integers", found=self.labels.dtype
             )
         check_rigid(self.grid_T_sensor, "observation grid_T_sensor")
         poses, ends = np.shape(self.grid_T_sensor)[:-2], self.ends
@@ -93,7 +93,7 @@ class Observation:
             raise FormatError(
                 "observation ends",
                 expected=f"shape {poses}, rising to {len(self)}",
-                found=str(ends),
+                found=ends,
             )
 
     def __len__(self) -> int:
@@ -176,7 +176,7 @@ def check_rule(rule: str, free_step_m: float) -> None:
         raise ArgumentError("rule", expected="sensor, sample or ray", found=repr(rule))
     if not (math.isfinite(free_step_m) and free_step_m > 0):
         raise ArgumentError(
-            "free_step_m", expected="a positive number of metres", found=str(free_step_m)
+            "free_step_m", expected="a positive number of metres", found=free_step_m
         )
 
 

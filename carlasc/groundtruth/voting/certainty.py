@@ -197,7 +197,7 @@ class VoxelCertainty:
             raise FormatError(
                 "evidence views",
                 expected=f"shape {self.occupied.shape}",
-                found=str(self.views.shape),
+                found=self.views.shape,
             )
 
 

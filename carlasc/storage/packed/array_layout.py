@@ -200,7 +200,7 @@ class FieldLayout:
             raise FormatError(
                 "its array", expected=f"shape {tuple(self.attributes['shape'])}, as in earlier "
                                       f"frames",
-                found=str(array.shape),
+                found=array.shape,
             )  # fmt: skip
         counts, chunks = {}, {}
         parts = self.packing.split(array)
@@ -225,7 +225,7 @@ class FieldLayout:
             "its array",
             expected=f"at most {self.frame_shape(widest)[-1]} elements ({_SLOTS} times a typical "
             f"frame)",
-            found=str(values.shape[-1]),
+            found=values.shape[-1],
             advice="leave the frame out, or pack to an .h5 store",
         )
 
