@@ -259,11 +259,7 @@ class SequenceInput(ABC):
         no scan can be read.
         """
         frames = self.frames
-        chosen = {
-            frames[0].source_frame,
-            frames[len(frames) // 2].source_frame,
-            frames[-1].source_frame,
-        }
+        chosen = {frames[place].source_frame for place in (0, len(frames) // 2, -1)}
         counts = []
         for frame in sorted(chosen):
             try:

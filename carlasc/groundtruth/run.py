@@ -197,7 +197,7 @@ def regrid(
             _begin(job)
             job.announce()
             open_things.enter_context(job.writer)
-        work = Work(jobs, plan, pool)
+        work = Work(jobs, pool)
         failures = work.run()
         if boxes_out is not None:
             (one,) = merged.values()
@@ -695,13 +695,14 @@ class SequenceJob:
         grid, writer, documents = self.plan.grid, self.writer, self._documents()
         if facts:
             inputs = self.inputs
-            classes, actors, poses = (
-                inputs.metadata.classes,
-                inputs.summaries(),
-                inputs.pose_facts(),
-            )
             report = Report.make(
-                grid, facts, self.params, classes, documents, actors=actors, poses=poses
+                grid,
+                facts,
+                self.params,
+                inputs.metadata.classes,
+                documents,
+                actors=inputs.summaries(),
+                poses=inputs.pose_facts(),
             )
             writer.write_document(layout.report_file(grid), report.to_json())
 
@@ -712,7 +713,6 @@ class Work:
 
     Attributes:
         jobs: the sequences.
-        plan: the plan of the run.
         spread: how the work is spread. Frames that are stored together are in one part.
         failures: frames that could not be made.
         wanted: number of frames to make.
@@ -721,7 +721,6 @@ class Work:
     """
 
     jobs: Series[SequenceJob]
-    plan: GridPlan
     spread: Run
     failures: list[FrameFailure] = field(default_factory=list)
     wanted: int = 0
@@ -791,15 +790,16 @@ class Work:
             job.check.begin(job.numbers, ())
         is_reported = not made and job.is_reported()
         if not (is_reported or (self.spread.part.count > 1 and job.missing())):
-            self._report(job, made, {done.task.number for done in made})
+            self._report(job, made)
         if made or job.check.must_record:
             job.check.finish({done.task.number for done in made if done.error is None})
 
-    def _report(self, job: SequenceJob, made: list[FrameResult], tried: Set[int]) -> None:
+    def _report(self, job: SequenceJob, made: list[FrameResult]) -> None:
         """Write the report of a sequence."""
         job.inputs.prepare(job.writer, self.spread, StepCounter(None))
         self.has_written = True
-        measured = _batches(job, job.tasks(job.reported - tried, job.writer), Run(1))
+        others = job.reported - {done.task.number for done in made}
+        measured = _batches(job, job.tasks(others, job.writer), Run(1))
         with closing(run_all(run_batch, measured, self.spread, lost=fail_batch)) as results:
             job.write_report([*made, *(done for batch in results for done in batch)])
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray, Float32Array
 from carlasc.core.boxes import BOXES_DTYPE
+from carlasc.core.classes import ClassTable
 from carlasc.errors import FormatError
 from carlasc.storage.arrays import ArrayFormat, npz_bytes, open_npz
 from carlasc.storage.files import damaged
@@ -18,6 +19,13 @@ from carlasc.storage.files import damaged
 VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "u1"), ("votes", "<u2")])
 WIDE_VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "<u2"), ("votes", "<u2")])
 VELOCITY_DTYPE = np.dtype([("voxel", "<i4"), ("velocity", "<f2", (3,))])
+
+
+def votes_dtype(classes: ClassTable) -> np.dtype[np.void]:
+    """Return the type of a row of votes for the classes of a table."""
+    return VOTES_DTYPE if classes.dtype == np.uint8 else WIDE_VOTES_DTYPE
+
+
 TABLES = {
     "votes": (VOTES_DTYPE, WIDE_VOTES_DTYPE),
     "velocities": (VELOCITY_DTYPE,),

@@ -137,18 +137,12 @@ class MapFiles:
     @property
     def all(self) -> list[Path]:
         """All files, and the folder."""
-        return [
-            path
-            for path in (
-                self.out,
-                self.mesh,
-                self.distance,
-                self.trajectory,
-                self.boxes,
-                self.actors,
-            )
-            if path is not None
-        ]
+        return [path for path in vars(self).values() if isinstance(path, Path)]
+
+    @property
+    def ending(self) -> str:
+        """The ending of `out`; "" without it."""
+        return "" if self.out is None else self.out.suffix.lower()
 
     def check(self, overwrite: bool) -> None:
         """Check, before hours of work, that no file is replaced and that packages are installed."""
@@ -158,10 +152,8 @@ class MapFiles:
                 found, advice = "a file" if path.is_file() else "a folder", "give another name"
                 advice = f"give `overwrite=True`, or {advice[5:]}" if is_ours else advice
                 raise ConflictError(path, expected="nothing", found=found, advice=advice)
-        is_las = self.out is not None and self.out.suffix.lower() == ".las"
-        for (module, extra), needed in zip(
-            _NEEDS, (self.mesh, self.mesh, self.distance, is_las), strict=True
-        ):
+        asked = (self.mesh, self.mesh, self.distance, self.ending == ".las")
+        for (module, extra), needed in zip(_NEEDS, asked, strict=True):
             if needed:
                 import_extra(module, extra)
         if self.boxes is not None:
@@ -172,13 +164,12 @@ class MapFiles:
         the mesh.
         """
         self.begin()
-        is_tree = self.out is not None and self.out.suffix.lower() == OCTOMAP
-        if self.out is not None and not is_tree:
+        if self.out is not None and self.ending != OCTOMAP:
             write_points(self.out, points)
-        if self.mesh is None and not is_tree:
+        if self.mesh is None and self.ending != OCTOMAP:
             return
         known = cells()
-        if self.out is not None and is_tree:
+        if self.out is not None and self.ending == OCTOMAP:
             known.write_octomap(self.out)
         if self.mesh is not None:
             occupied = known.labels > 0
@@ -238,12 +229,8 @@ class SurfaceMesh:
         Raises:
             DependencyError: scikit-image is not installed.
         """
-        nodes, faces, classes, count = (
-            [np.empty((0, 3), np.int64)],
-            [np.empty((0, 3), np.int64)],
-            [np.empty(0, np.int64)],
-            0,
-        )
+        nodes, faces = [np.empty((0, 3), np.int64)], [np.empty((0, 3), np.int64)]
+        classes, count = [np.empty(0, np.int64)], 0
         for corner, volume in _blocks(cells, labels):
             vertices, triangles, own = _march(volume)
             nodes.append(vertices + _STEPS * corner)

@@ -30,7 +30,7 @@ from carlasc.core.geometry import Transform, check_rigid
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.storage.field_files import VOTES_DTYPE, WIDE_VOTES_DTYPE
+from carlasc.storage.field_files import VOTES_DTYPE, votes_dtype
 
 if TYPE_CHECKING:
     from carlasc.core.cells import Pose
@@ -404,9 +404,7 @@ class Votes:
         """
         from carlasc.groundtruth.voting import kernel
 
-        votes = np.empty(
-            np.count_nonzero(self.free) + len(self.occupied),
-            VOTES_DTYPE if self.classes.dtype == np.uint8 else WIDE_VOTES_DTYPE,
-        )
+        rows = np.count_nonzero(self.free) + len(self.occupied)
+        votes = np.empty(rows, votes_dtype(self.classes))
         kernel.interleave(self.free.reshape(-1), self.occupied, votes, _MOST_VOTES)
         return votes
