@@ -211,8 +211,7 @@ class ConfusionMatrix(Summed):
         """
         check_choice("absent", absent, Absent)
         iou = self.iou if with_free else np.delete(self.iou, self.free)
-        iou = np.nan_to_num(iou) if absent == "zero" else iou[~np.isnan(iou)]
-        return float(iou.mean()) if len(iou) else float("nan")
+        return mean_of(np.nan_to_num(iou) if absent == "zero" else iou)
 
     @property
     def accuracy(self) -> float:
@@ -224,11 +223,7 @@ class ConfusionMatrix(Summed):
         occupied = np.arange(self.num_classes) != self.free
         hit = self.counts[np.ix_(occupied, occupied)].sum()
         predicted, true = self.counts[:, occupied].sum(), self.counts[occupied].sum()
-        return Completeness(
-            float(ratio(hit, predicted)),
-            float(ratio(hit, true)),
-            float(ratio(hit, predicted + true - hit)),
-        )
+        return Completeness(*ratio([hit] * 3, [predicted, true, predicted + true - hit]).tolist())
 
 
 def check_free(free: int, num_classes: int) -> None:
@@ -243,6 +238,12 @@ def ratio(numerator: Any, denominator: Any) -> FloatArray:
     return np.divide(
         numerator, denominator, out=np.full(denominator.shape, np.nan), where=denominator > 0
     )
+
+
+def mean_of(values: FloatArray) -> float:
+    """Return the mean of the values that are not NaN; NaN if there are none."""
+    present = values[~np.isnan(values)]
+    return float(present.mean()) if present.size else float("nan")
 
 
 def json_number(value: float) -> float | None:
