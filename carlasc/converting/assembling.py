@@ -99,17 +99,15 @@ class LayoutOptions:
         own = converter.classes.name
         check_choice("classes", self.classes, ("auto", "carla", own))
         usual = own if converter.keeps_classes else "carla"
-        if (usual if self.classes == "auto" else self.classes) == own:
-            return AxesAndClasses(converter.classes, None, self.axes == "left", self.allow_unknown)
-        if converter.to_carla is None:
+        keeps = (usual if self.classes == "auto" else self.classes) == own
+        if not keeps and converter.to_carla is None:
             raise ArgumentError(
                 "classes",
                 expected=f"{converter.classes.name}, because no map to CarlaSC's classes exists",
                 found="carla",
             )
-        return AxesAndClasses(
-            converter.classes, converter.to_carla, self.axes == "left", self.allow_unknown
-        )
+        remap = None if keeps else converter.to_carla
+        return AxesAndClasses(converter.classes, remap, self.axes == "left", self.allow_unknown)
 
 
 @dataclass(frozen=True)
