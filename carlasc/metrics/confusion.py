@@ -404,7 +404,12 @@ def _in_range(labels: AnyArray, counted: BoolArray, num_classes: int, name: str)
         return labels
     wrong = ((labels < 0) | (labels >= num_classes)) & counted
     if wrong.any():
-        raise _out_of_range(name, int(labels[wrong][0]), int(wrong.sum()), num_classes)
+        raise FormatError(
+            name,
+            expected=f"class ids 0..{num_classes - 1}",
+            found=f"{int(labels[wrong][0])} ({wrong.sum()} voxels are out of range)",
+            advice="remap the labels, or mask these voxels",
+        )
     return np.where(counted, labels, 0)
 
 
@@ -466,12 +471,3 @@ def flat_sides(
     check_ids("prediction", arrays[0], num_classes)
     check_ids("truth", arrays[2], num_classes)
     return arrays
-
-
-def _out_of_range(name: str, found: int, times: int, num_classes: int) -> FormatError:
-    return FormatError(
-        name,
-        expected=f"class ids 0..{num_classes - 1}",
-        found=f"{found} ({times} voxels are out of range)",
-        advice="remap the labels, or mask these voxels",
-    )
