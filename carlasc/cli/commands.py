@@ -34,8 +34,10 @@ _UsageError: Any = typer.BadParameter.__mro__[1]  # typer does not export it
 
 
 class _Plain:
-    """Errors in one line, and plain help. Lets options without a value, and texts, skip typer's conversion of values, which loads
-    pydantic: 0.1 s, as long as it takes to load what most commands need.
+    """Plain help, and errors in one line.
+
+    Options without a value, and texts, skip typer's conversion of values, which loads pydantic:
+    0.1 s, as long as it takes to load what most commands need.
 
     Attributes:
         texts: names of the parameters whose values are taken as they are typed.

@@ -59,7 +59,7 @@ from carlasc.storage.files import to_json
 from carlasc.storage.inputs import PROVISIONAL, MadeFrom
 from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import SequenceWriter, Sink
-from carlasc.storage.resuming import agree_lines, agree_metadata, check_grid
+from carlasc.storage.resuming import agree_lines, agree_metadata, check_grid, read_metadata
 
 if TYPE_CHECKING:
     from carlasc.motion.odometry import UsableScan
@@ -577,8 +577,7 @@ def begin(plan: RecordingPlan, target: AxesAndClasses, metadata: Metadata) -> No
     if not plan.recording.rays:
         extra["rays"] = False
     where = f"{writer.location}/{layout.METADATA}"
-    existing = writer.read_document(layout.METADATA)
-    before = None if existing is None else Metadata.from_json(existing, where)
+    before = read_metadata(writer)
     if before is not None and before.extra.get("poses") != plan.pose_source:
         raise ConflictError(
             where,
@@ -596,7 +595,7 @@ def begin(plan: RecordingPlan, target: AxesAndClasses, metadata: Metadata) -> No
     _announce(plan)
     described = replace(metadata, extra=extra)
     documents = {layout.METADATA: agree_metadata(writer, described)}
-    if plan.again and existing is not None:
+    if plan.again and before is not None:
         documents[layout.METADATA] = described.to_json()
     documents[layout.TIMES] = agree_lines(
         writer,
@@ -649,10 +648,9 @@ def write_found(plan: RecordingPlan, height_m: float | None) -> None:
     """Add what was found while scans were read to carlasc.json: the height of the first sensor
     above the ground, if it is not known, and findings.
     """
-    data = plan.writer.read_document(layout.METADATA)
-    if data is None:
+    metadata = read_metadata(plan.writer)
+    if metadata is None:
         return
-    metadata = Metadata.from_json(data, f"{plan.writer.location}/{layout.METADATA}")
     extra = dict(metadata.extra)
     if height_m is not None and extra.get("sensors") and metadata.height_m is None:
         first, *others = extra["sensors"]
