@@ -21,9 +21,9 @@ from carlasc.core.choices import CompareInputs
 from carlasc.core.frames import FrameRange
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.errors import ArgumentError, CarlascError, MissingDataError, count
-from carlasc.groundtruth.options import FromGrid, FromScans, Observe, Voting
+from carlasc.groundtruth.options import FromGrid, FromScans, Observe, VoteRule, Voting
 from carlasc.groundtruth.reporting import PoseFacts, Residual
-from carlasc.groundtruth.voting.ballot import VoteRule, Votes
+from carlasc.groundtruth.voting.ballot import Votes
 from carlasc.groundtruth.voting.certainty import VoxelCertainty
 from carlasc.groundtruth.voxel_actors import VoxelActors
 from carlasc.running.spreading import Run, StepCounter

@@ -343,12 +343,12 @@ def _prepare(
 def settings_of(inputs: SequenceInput, plan: GridPlan) -> dict[str, Any]:
     """Return the params.json of the grid of a sequence, as a later run reads it."""
     how = {"free_step_m": float(plan.voting.free_step_m), "voting": plan.rule}
-    how |= (
-        {"min_confidence": float(plan.voting.min_confidence)} if plan.voting.min_confidence else {}
-    )
+    if plan.voting.min_confidence:
+        how["min_confidence"] = float(plan.voting.min_confidence)
     made_from = inputs.record()
     record = {"format": RECORD_FORMAT, "rule": RULES[made_from["observe"]], **made_from, **how}
-    record |= {"labels": inputs.metadata.predicted} if inputs.metadata.predicted else {}
+    if inputs.metadata.predicted:
+        record["labels"] = inputs.metadata.predicted
     settings = plan.spec.to_params(inputs.metadata.classes.num_channels) | {RECORD: record}
     return parse_json(to_json(settings), plan.grid)
 
@@ -480,9 +480,9 @@ class FrameTask:
         names = (*layout.SCAN_FIELDS, *(f"{plan.grid}/{part}" for part in layout.GRID_FIELDS))
         with reading(f"frame {self.number}", "a grid with labels and counts"):
             for name in names:
-                if writer.has(name, self.number):
-                    array = writer.read(name, self.number)
-                    arrays |= {} if array is None else {name: array}
+                has = writer.has(name, self.number)
+                if has and (array := writer.read(name, self.number)) is not None:
+                    arrays[name] = array
             labels, counts = (
                 arrays[f"{plan.grid}/{part}"].reshape(plan.spec.size)
                 for part in ("labels", "counts")

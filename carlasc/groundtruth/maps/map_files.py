@@ -172,11 +172,7 @@ class MapFiles:
         if self.out is not None and self.ending == OCTOMAP:
             known.write_octomap(self.out)
         if self.mesh is not None:
-            occupied = known.labels > 0
-            surface = SurfaceMesh.of(
-                known.index[occupied], known.labels[occupied], known.lower, known.size
-            )
-            surface.write(self.mesh, points.classes)
+            SurfaceMesh.of(known).write(self.mesh, points.classes)
 
 
 MESH_ENDINGS = (".ply", ".glb")
@@ -211,27 +207,16 @@ class SurfaceMesh:
     labels: IntArray
 
     @classmethod
-    def of(
-        cls,
-        cells: IntArray,
-        labels: AnyIntArray,
-        lower: FloatArray,
-        size: FloatArray,
-    ) -> SurfaceMesh:
-        """Mesh cells by marching cubes.
-
-        Args:
-            cells: (N, 3) indices of the occupied cells.
-            labels: (N,) their classes, none 0.
-            lower: (3,) lower corner of the cell (0, 0, 0), metres.
-            size: (3,) size of a cell, metres.
+    def of(cls, known: MapCells) -> SurfaceMesh:
+        """Mesh the occupied ones of some cells by marching cubes.
 
         Raises:
             DependencyError: scikit-image is not installed.
         """
         nodes, faces = [np.empty((0, 3), np.int64)], [np.empty((0, 3), np.int64)]
         classes, count = [np.empty(0, np.int64)], 0
-        for corner, volume in _blocks(cells, labels):
+        occupied = known.labels > 0
+        for corner, volume in _blocks(known.index[occupied], known.labels[occupied]):
             vertices, triangles, own = _march(volume)
             nodes.append(vertices + _STEPS * corner)
             faces.append(triangles + count)
@@ -241,7 +226,7 @@ class SurfaceMesh:
             np.concatenate(nodes), axis=0, return_index=True, return_inverse=True
         )
         return cls(
-            lower + (whole / _STEPS + 0.5) * size,
+            known.lower + (whole / _STEPS + 0.5) * known.size,
             place.reshape(-1)[np.concatenate(faces)],
             np.concatenate(classes)[first],
         )
