@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -242,7 +241,7 @@ class DerivedCopy:
         Raises:
             StorageError: the files cannot be written.
         """
-        began, linked = time.perf_counter(), 0
+        linked = 0
         if not is_url(self.out):
             folder = self.folder if self.mark is None else self.partial
             linked = sum(_link_files(one, folder / path) for path, one in sequences.items())
@@ -262,8 +261,7 @@ class DerivedCopy:
                 copied = unpack(ChosenSequences(self.source.location, sequences), self.out, run=run)
         self._finish(sequences)
         return CopyResult(
-            **vars(copied)
-            | {"kept": copied.kept - linked, "elapsed_s": time.perf_counter() - began},
+            **vars(copied) | {"kept": copied.kept - linked},
             linked=linked,
             left_out=sorted({name for one in sequences.values() for name in one.left_out}),
         )
