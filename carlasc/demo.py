@@ -12,16 +12,13 @@ from typing import TYPE_CHECKING, get_args
 from carlasc.core.choices import Preset, TrafficLevel
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ConflictError, DependencyError, import_extra
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Progress, Run
 from carlasc.storage.files import AnyPath
 
 if TYPE_CHECKING:
     from carlasc.inspection.findings import ValidationResult
     from carlasc.inspection.statistics import Statistics
     from carlasc.viewing import CameraOptions, Scene
-
-Progress = Callable[[int, int], None]
-"""Takes (done, total)."""
 
 Step = Callable[[str], AbstractContextManager[Progress]]
 """Takes the name of a step, and returns a context manager that gives its progress callback."""

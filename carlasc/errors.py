@@ -49,7 +49,7 @@ class CarlascError(Exception):
             location, such as a source, is named by it.
         problem: what went wrong, if "expected ..., found ..." is not sufficient.
         expected: the expected value or state.
-        found: the actual value or state.
+        found: the actual value or state; an object is shown as `str` does.
         advice: what the user can do. It names arguments as `` `overwrite=True` ``, which the
             command line replaces by its options.
     """
@@ -60,7 +60,7 @@ class CarlascError(Exception):
         *,
         problem: str = "",
         expected: str = "",
-        found: str = "",
+        found: object = "",
         advice: str = "",
     ) -> None:
         shown = without_credentials(str(getattr(where, "location", where)))
@@ -70,7 +70,7 @@ class CarlascError(Exception):
             # __dict__
         )
         self.where, self.problem = shown, problem
-        self.expected, self.found, self.advice = expected, found, advice
+        self.expected, self.found, self.advice = expected, str(found), advice
 
     def __str__(self) -> str:
         where, problem, expected, found, advice = (

@@ -243,7 +243,7 @@ class Capture:
                     where[name],
                     expected=f"{len(arrays['points'])} values, one per point of "
                     f"{array_path('points', sensor, frame)}",
-                    found=str(len(arrays[name])),
+                    found=len(arrays[name]),
                 )
         scan = Scan(arrays["points"], labels=arrays["labels"], instances=arrays["instances"])
         return SensorRecording(

@@ -39,7 +39,7 @@ def check_at_least(minimum: int, **values: int) -> None:
     """
     for name, value in values.items():
         if value < minimum:
-            raise ArgumentError(name, expected=f"at least {minimum}", found=str(value))
+            raise ArgumentError(name, expected=f"at least {minimum}", found=value)
 
 
 EGO_SENSOR_M = (-0.5, 0.0, 1.8)
@@ -104,7 +104,7 @@ class Lidar:
             ),
         ):
             if not valid:
-                raise ArgumentError(name, expected=expected, found=str(found))
+                raise ArgumentError(name, expected=expected, found=found)
 
     @classmethod
     def named(cls, name: LidarName, **others: Any) -> Self:
@@ -249,7 +249,7 @@ class LidarEffects:
         check_types(LidarEffects, vars(self))
         for name in ("drop_outs", "range_noise", "reflections", "rain"):
             if not 0 <= (value := getattr(self, name)) <= 1:
-                raise ArgumentError(name, expected="from 0 to 1", found=str(value))
+                raise ArgumentError(name, expected="from 0 to 1", found=value)
 
     @property
     def fields(self) -> tuple[str, ...]:

@@ -89,7 +89,7 @@ class Simulator(Capture, ABC):
         self.seed, self.traffic, self.lidar, self.bev = seed, traffic, lidar or Lidar(), bev
         self.cameras = {camera.name: camera for camera in self.make_cameras(cameras)}
         if effects != LidarEffects() and type(self).read_scan is Capture.read_scan:
-            raise ArgumentError("effects", expected="none: its scans are ideal", found=str(effects))
+            raise ArgumentError("effects", expected="none: its scans are ideal", found=effects)
         self.effects = effects
 
     @abstractmethod
@@ -111,7 +111,7 @@ class Simulator(Capture, ABC):
             ArgumentError: the simulator has no such camera.
         """
         if names:
-            raise ArgumentError("cameras", expected="none: it has no cameras", found=str(names))
+            raise ArgumentError("cameras", expected="none: it has no cameras", found=names)
         return ()
 
     def check_packages(self) -> None:

@@ -33,9 +33,11 @@ _INTERRUPTED = (
 _UsageError: Any = typer.BadParameter.__mro__[1]  # typer does not export it
 
 
-class _Converting:
-    """Lets options without a value, and texts, skip typer's conversion of values, which loads
-    pydantic: 0.1 s, as long as it takes to load what most commands need.
+class _Plain:
+    """Plain help, and errors in one line.
+
+    Options without a value, and texts, skip typer's conversion of values, which loads pydantic:
+    0.1 s, as long as it takes to load what most commands need.
 
     Attributes:
         texts: names of the parameters whose values are taken as they are typed.
@@ -52,16 +54,14 @@ class _Converting:
                 one.process_value = partial(_process, one, one.process_value, is_text)
         return parameters
 
-
-class Command(_Converting, TyperCommand):
-    """A command with plain help, whose errors are one line on stderr and an exit code."""
-
     def make_context(
         self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any
     ) -> Any:
         """Read the arguments."""
         with _errors_in_one_line(self):
-            return super().make_context(info_name, args, parent, **extra)
+            return super().make_context(  # type: ignore[misc]
+                info_name, args, parent, **extra
+            )
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command.
@@ -69,31 +69,29 @@ class Command(_Converting, TyperCommand):
         Exit codes: 1 if the work failed, 2 for a wrong argument, 130 if it was interrupted.
         """
         with _errors_in_one_line(self):
-            return super().invoke(ctx)
+            return super().invoke(ctx)  # type: ignore[misc]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the arguments, and the options under their headings."""
         write_options(self.get_params(ctx), ctx, formatter)
 
 
-class CommandGroup(_Converting, TyperGroup):
+class Command(_Plain, TyperCommand):
+    """A command with plain help, whose errors are one line on stderr and an exit code."""
+
+
+class CommandGroup(_Plain, TyperGroup):
     """The commands. An unknown name prints one line on stderr."""
 
     def make_context(
         self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any
     ) -> Any:
         """Read the options before the command. Without arguments, print the help."""
-        with _errors_in_one_line(self):
-            return super().make_context(info_name, args or ["--help"], parent, **extra)
-
-    def invoke(self, ctx: Any) -> Any:
-        """Run a command."""
-        with _errors_in_one_line(self):
-            return super().invoke(ctx)
+        return super().make_context(info_name, args or ["--help"], parent, **extra)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the options and the commands."""
-        write_options(self.get_params(ctx), ctx, formatter)
+        super().format_options(ctx, formatter)
         rows = [(name, self.summary(name)) for name in self.list_commands(ctx)]
         with formatter.section("Commands"):
             formatter.write_dl(rows)

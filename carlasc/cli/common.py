@@ -92,9 +92,9 @@ def place_argument(
     return typer.Argument(metavar=name, help=text, callback=read, show_default=default or True)
 
 
-def file_argument(text: str, name: str = "OUT") -> Any:
+def file_argument(text: str) -> Any:
     """Return an argument for a path on this machine, where files of other formats are written."""
-    return place_argument(text, name, read=read_file)
+    return place_argument(text, "OUT", read=read_file)
 
 
 def place_option(*flags: str, text: str, read: Any = read_place, **settings: Any) -> Any:

@@ -84,12 +84,10 @@ def _observe(
         kind = "scans" if for_scans else "grid"
     if for_scans and kind != "scans":
         raise ArgumentError(
-            "observe", expected="scans, because options for scans are given", found=str(kind)
+            "observe", expected="scans, because options for scans are given", found=kind
         )
     if grid is not None and kind != "grid":
-        raise ArgumentError(
-            "observe", expected="grid, because --from-grid is given", found=str(kind)
-        )
+        raise ArgumentError("observe", expected="grid, because --from-grid is given", found=kind)
     match kind:
         case "capture":
             return carlasc.FromCapture()

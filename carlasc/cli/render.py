@@ -60,7 +60,7 @@ def render(
     scenes = [scene.make(source) for source in sources]
     if len(scenes) > 1 and not grid_of:
         raise ArgumentError(
-            "SOURCE", expected="one", found=str(len(scenes)), advice="draw several with --grid-of"
+            "SOURCE", expected="one", found=len(scenes), advice="draw several with --grid-of"
         )
     result: carlasc.viewing.RenderResult
     if over is not None:

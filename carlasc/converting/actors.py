@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -148,24 +149,18 @@ class _ObservationChain:
         return max(sorted(self.label_counts), key=self.label_counts.__getitem__)
 
 
-@dataclass(frozen=True)
-class _VelocityEstimate:
-    """Estimates the velocities of an actor, in a worker."""
-
-    classes: ClassTable
-
-    def __call__(self, chain: _ObservationChain) -> list[Velocity]:
-        """Return the velocity in each frame of a chain, in the sensor frame of that frame."""
-        poses, seconds = np.stack(chain.poses), np.array(chain.seconds)
-        observations = [
-            transform_points(pose, points) for pose, points in zip(poses, chain.points, strict=True)
-        ]
-        rigid = chain.label not in self.classes.deformable
-        positions, velocities, headings = estimate_path(observations, seconds, rigid=rigid)
-        if not self.classes.moving and is_static(observations, positions, headings, seconds):
-            velocities = np.zeros_like(velocities)
-        own = multiply(invert(poses)[:, :3, :3], velocities[:, :, None])[:, :, 0]
-        return [(x, y, z) for x, y, z in own.tolist()]
+def _velocities_of(chain: _ObservationChain, classes: ClassTable) -> list[Velocity]:
+    """Return the velocity in each frame of a chain, in the sensor frame of that frame."""
+    poses, seconds = np.stack(chain.poses), np.array(chain.seconds)
+    observations = [
+        transform_points(pose, points) for pose, points in zip(poses, chain.points, strict=True)
+    ]
+    rigid = chain.label not in classes.deformable
+    positions, velocities, headings = estimate_path(observations, seconds, rigid=rigid)
+    if not classes.moving and is_static(observations, positions, headings, seconds):
+        velocities = np.zeros_like(velocities)
+    own = multiply(invert(poses)[:, :3, :3], velocities[:, :, None])[:, :, 0]
+    return [(x, y, z) for x, y, z in own.tolist()]
 
 
 class ActorMotion:
@@ -179,7 +174,7 @@ class ActorMotion:
     """
 
     def __init__(self, classes: ClassTable, run: Run) -> None:
-        self._estimate, self._run_options = _VelocityEstimate(classes), run
+        self._classes, self._run_options = classes, run
         self._chains: dict[int, _ObservationChain] = {}
         self._ended: list[_ObservationChain] = []
         self._velocities: dict[int, dict[int, Velocity]] = {}
@@ -231,7 +226,8 @@ class ActorMotion:
         # longest first: no worker ends late
         chains = sorted(self._ended, key=_ObservationChain.size, reverse=True)
         self._ended = []
-        with closing(run_all(self._estimate, chains, self._run_options)) as estimates:
+        estimate = partial(_velocities_of, classes=self._classes)
+        with closing(run_all(estimate, chains, self._run_options)) as estimates:
             for chain, velocities in zip(chains, estimates, strict=True):
                 for frame, velocity in zip(chain.frames, velocities, strict=True):
                     self._velocities.setdefault(frame, {})[chain.actor] = velocity

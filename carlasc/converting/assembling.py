@@ -99,17 +99,15 @@ class LayoutOptions:
         own = converter.classes.name
         check_choice("classes", self.classes, ("auto", "carla", own))
         usual = own if converter.keeps_classes else "carla"
-        if (usual if self.classes == "auto" else self.classes) == own:
-            return AxesAndClasses(converter.classes, None, self.axes == "left", self.allow_unknown)
-        if converter.to_carla is None:
+        keeps = (usual if self.classes == "auto" else self.classes) == own
+        if not keeps and converter.to_carla is None:
             raise ArgumentError(
                 "classes",
                 expected=f"{converter.classes.name}, because no map to CarlaSC's classes exists",
                 found="carla",
             )
-        return AxesAndClasses(
-            converter.classes, converter.to_carla, self.axes == "left", self.allow_unknown
-        )
+        remap = None if keeps else converter.to_carla
+        return AxesAndClasses(converter.classes, remap, self.axes == "left", self.allow_unknown)
 
 
 @dataclass(frozen=True)
@@ -301,9 +299,7 @@ def _check(cloud: Cloud, rig: Rig, where: str) -> None:
         found = f"{cloud.points.shape} {cloud.points.dtype}"
         raise FormatError(f"{where}: points", expected="shape (N, 4) float32", found=found)
     if not 0 <= cloud.sensor < len(rig.sensors):
-        raise FormatError(
-            where, expected=f"a sensor 0..{len(rig.sensors) - 1}", found=str(cloud.sensor)
-        )
+        raise FormatError(where, expected=f"a sensor 0..{len(rig.sensors) - 1}", found=cloud.sensor)
     fields = {
         "labels": cloud.labels,
         "instances": cloud.instances,
@@ -315,7 +311,7 @@ def _check(cloud: Cloud, rig: Rig, where: str) -> None:
             raise FormatError(
                 f"{where}: {name}",
                 expected=f"one for each of {count} points",
-                found=str(len(values)),
+                found=len(values),
             )
     if cloud.seconds is not None and not np.isfinite(cloud.seconds).all():
         found = f"NaN or infinity at point {int(np.argmin(np.isfinite(cloud.seconds)))}"

@@ -163,7 +163,7 @@ class Clips:
                 raise MissingDataError(tree.location, expected="a clip", found="nothing")
             if (total := sum(sizes.values())) > self.most:
                 expected = f"at most {self.most} bytes, the size of the scratch"
-                raise CarlascError(tree.location, expected=expected, found=str(total))
+                raise CarlascError(tree.location, expected=expected, found=total)
             place = self.scratch / combined(name) / tree.location.rpartition("/")[2]
             with writing(place):
                 held = self._reserve(place, sizes)
@@ -241,7 +241,7 @@ def convert_clips(
     if size is None:
         raise ArgumentError("scratch", expected="a size, such as 20GB", found=scratch)
     if str(out).endswith(PACKED):
-        raise ArgumentError("out", expected="a folder for a list of clips", found=str(out))
+        raise ArgumentError("out", expected="a folder for a list of clips", found=out)
     most = int(float(size[1]) * _UNITS[size[2]])
     names, part = run.part.share(read_list(run, lambda: sorted(tree_of(source).entries())))
     folder = Path(tempfile.gettempdir()) / f"carlasc-{combined(str(out), str(run.part))}"

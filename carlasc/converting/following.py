@@ -119,7 +119,7 @@ def follow(
     if layout.level:
         raise ArgumentError("level", expected="False while the drive grows", found="True")
     if not isinstance(sink, FolderSink):
-        raise ArgumentError("out", expected="a folder, while the drive grows", found=str(out))
+        raise ArgumentError("out", expected="a folder, while the drive grows", found=out)
     poses, layout = replace(poses, source="kiss-icp"), replace(layout, boxes=None)
     converter = open_converter(name, root, options)
     look = _Folder(converter, idle_s, say, wait)

@@ -172,11 +172,9 @@ def map(
     check_types(map, locals())
     began = time.perf_counter()
     if not (math.isfinite(cell_m) and cell_m >= _LEAST_CELL_M):
-        raise ArgumentError(
-            "cell_m", expected=f"{_LEAST_CELL_M:g} metres or more", found=str(cell_m)
-        )
+        raise ArgumentError("cell_m", expected=f"{_LEAST_CELL_M:g} metres or more", found=cell_m)
     if run.part.count > 1:
-        raise ArgumentError("part", expected="none, as a map is one file", found=str(run.part))
+        raise ArgumentError("part", expected="none, as a map is one file", found=run.part)
     given_files = {name: path for name, path in vars(extras).items() if name != "actors"}
     files = MapFiles.of({"out": out, **given_files}, extras.actors, grid)
     wanted, keep, options = FrameRange.of(frames), recording.keep, recording.options

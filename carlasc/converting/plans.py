@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -58,7 +59,7 @@ from carlasc.storage.files import to_json
 from carlasc.storage.inputs import PROVISIONAL, MadeFrom
 from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import SequenceWriter, Sink
-from carlasc.storage.resuming import agree_lines, agree_metadata, check_grid
+from carlasc.storage.resuming import agree_lines, agree_metadata, check_grid, read_metadata
 
 if TYPE_CHECKING:
     from carlasc.motion.odometry import UsableScan
@@ -139,7 +140,7 @@ class RecordingPlan(Examined):
 
     def make_again(self, *, is_same: bool) -> None:
         """Make all frames again, because the data set changed."""
-        numbers = {handle.number for handle in self.recording.frames}
+        numbers = set(self.recording.frame_numbers)
         self.is_same = is_same
         self.again, self.missing, self.unfinished = True, numbers, set(numbers)
 
@@ -309,7 +310,7 @@ def examine(
             "frames",
             expected=f"frames of {recording.location}: {recording.frames[0].number} to "
             f"{recording.frames[-1].number}",
-            found=str(frames),
+            found=frames,
         )
     if trajectory is not None and trajectory.seconds is not None:
         numbers = np.array([handle.number for handle in chosen])
@@ -347,10 +348,10 @@ def examine(
             try:
                 notes.append(check_poses(recording, converter, poses))
             except FormatError as error:
-                swapped = None if trajectory is None else _swapped(trajectory)
                 try:
-                    if swapped is None:
+                    if trajectory is None or trajectory.other is None:
                         raise
+                    swapped = replace(trajectory, world_T_vehicle=trajectory.other, other=None)
                     other = scan_poses(swapped, recording, times)[:last]
                     notes.append(check_poses(recording, converter, other))
                     notes.append(f"quaternions in {swapped.where} are w, x, y, z: scans overlap so")
@@ -369,13 +370,6 @@ def examine(
     return Examined(
         recording, times, own_times is not None, trajectory, poses, mount, said, findings
     )
-
-
-def _swapped(given: Trajectory) -> Trajectory | None:
-    """Return the poses with the other order of quaternions; None if the order is certain."""
-    if given.other is None:
-        return None
-    return replace(given, world_T_vehicle=given.other, other=None)
 
 
 def _some_scans(
@@ -481,7 +475,7 @@ def plan_recording(
         given=given,
     )
     plan.place_boxes()
-    numbers = {handle.number for handle in recording.frames}
+    numbers = set(recording.frame_numbers)
     plan.missing = {number for number in numbers if not writer.has("points", number)}
     there = numbers - plan.missing
     plan.unfinished = plan.missing | {n for n in there if not _finished(plan, n)}
@@ -531,9 +525,14 @@ def _check_voxels(recording: Recording, writer: SequenceWriter, target: AxesAndC
             found="none",
             advice="copy them too, or take another value of `grids`",
         )
-    frames = [handle.number for handle in recording.frames]
     params = _voxel_params(recording.voxels, target)
-    check_grid(writer, layout.grid_folder(recording.voxels), params, frames, overwrite=False)
+    check_grid(
+        writer,
+        layout.grid_folder(recording.voxels),
+        params,
+        recording.frame_numbers,
+        overwrite=False,
+    )
     return recording.voxels
 
 
@@ -546,7 +545,7 @@ def _announce(plan: RecordingPlan) -> None:
         with suppress(CarlascError):  # the error is reported when the frame is read again
             points.append(sum(len(cloud.points) for cloud in handle.read()))
     plan.writer.expect(
-        {"points": [handle.number for handle in frames]},
+        {"points": plan.recording.frame_numbers},
         {"points": max(points)} if points else None,
     )
 
@@ -578,13 +577,12 @@ def begin(plan: RecordingPlan, target: AxesAndClasses, metadata: Metadata) -> No
     if not plan.recording.rays:
         extra["rays"] = False
     where = f"{writer.location}/{layout.METADATA}"
-    existing = writer.read_document(layout.METADATA)
-    before = None if existing is None else Metadata.from_json(existing, where)
+    before = read_metadata(writer)
     if before is not None and before.extra.get("poses") != plan.pose_source:
         raise ConflictError(
             where,
             expected=f"poses from {plan.pose_source}",
-            found=str(before.extra.get("poses", "others")),
+            found=before.extra.get("poses", "others"),
             advice="write to another place",
         )
     if before is not None and _places(before.extra) not in ([], _places(extra)):
@@ -597,7 +595,7 @@ def begin(plan: RecordingPlan, target: AxesAndClasses, metadata: Metadata) -> No
     _announce(plan)
     described = replace(metadata, extra=extra)
     documents = {layout.METADATA: agree_metadata(writer, described)}
-    if plan.again and existing is not None:
+    if plan.again and before is not None:
         documents[layout.METADATA] = described.to_json()
     documents[layout.TIMES] = agree_lines(
         writer,
@@ -629,11 +627,10 @@ def write_poses(plan: RecordingPlan, target: AxesAndClasses) -> None:
     assert plan.poses is not None
     poses = mirror_poses(plan.poses) if target.mirrored else plan.poses
     if plan.is_same or (plan.again and plan.pose_source == KISS_ICP):
-        _write(plan, {layout.POSES: layout.encode_poses(poses)})
+        lines: bytes | None = layout.encode_poses(poses)
     else:
-        _write(
-            plan, {layout.POSES: agree_lines(plan.writer, layout.POSES, poses, is_whole=plan.again)}
-        )
+        lines = agree_lines(plan.writer, layout.POSES, poses, is_whole=plan.again)
+    _write(plan, {layout.POSES: lines})
 
 
 def _places(extra: Mapping[str, Any]) -> list[object]:
@@ -651,10 +648,9 @@ def write_found(plan: RecordingPlan, height_m: float | None) -> None:
     """Add what was found while scans were read to carlasc.json: the height of the first sensor
     above the ground, if it is not known, and findings.
     """
-    data = plan.writer.read_document(layout.METADATA)
-    if data is None:
+    metadata = read_metadata(plan.writer)
+    if metadata is None:
         return
-    metadata = Metadata.from_json(data, f"{plan.writer.location}/{layout.METADATA}")
     extra = dict(metadata.extra)
     if height_m is not None and extra.get("sensors") and metadata.height_m is None:
         first, *others = extra["sensors"]
@@ -813,23 +809,18 @@ def jitter_note(poses: FloatArray) -> str | None:
     )
 
 
-@dataclass(frozen=True)
-class _ReadUsable:
-    """Reads the points of a scan for odometry, in a worker, while poses of earlier scans are
+def _read_usable(handle: FrameHandle, rig: Rig) -> UsableScan | CarlascError | OSError:
+    """Read the points of a scan for odometry, in a worker, while poses of earlier scans are
     estimated.
     """
+    from carlasc.motion.odometry import usable_points
 
-    rig: Rig
-
-    def __call__(self, handle: FrameHandle) -> UsableScan | CarlascError | OSError:
-        from carlasc.motion.odometry import usable_points
-
-        try:
-            scan = read_scan(handle, self.rig, None)
-        except (CarlascError, OSError) as error:
-            return error
-        used, seconds = usable_points(scan.points), scan.fields.get("seconds")
-        return scan.points[used, :3], None if seconds is None else seconds[used]
+    try:
+        scan = read_scan(handle, rig, None)
+    except (CarlascError, OSError) as error:
+        return error
+    used, seconds = usable_points(scan.points), scan.fields.get("seconds")
+    return scan.points[used, :3], None if seconds is None else seconds[used]
 
 
 def estimate_poses(
@@ -861,7 +852,7 @@ def estimate_poses(
     errors: list[CarlascError | OSError] = []
 
     def scans() -> Iterator[tuple[int, UsableScan]]:
-        with closing(run_all(_ReadUsable(plan.rig), recording.frames, run)) as read:
+        with closing(run_all(partial(_read_usable, rig=plan.rig), recording.frames, run)) as read:
             for handle, scan in zip(recording.frames, read, strict=True):
                 step()
                 if isinstance(scan, Exception):
@@ -993,4 +984,4 @@ def _diagnose(recording: Recording, converter: Converter, poses: FloatArray) -> 
             return np.empty((0, 3))  # the conversion of the frame reports the error
         return structure_of(scan.points[:, :3], scan.labels, None, converter.classes)
 
-    return diagnose_poses(structure, poses[[handle.number for handle in recording.frames]])
+    return diagnose_poses(structure, poses[recording.frame_numbers])

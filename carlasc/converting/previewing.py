@@ -99,20 +99,17 @@ def preview(
     converter = open_converter(name, Path(source), options)
     recordings = choose_recordings(find_recordings(converter), Path(source), sequences, split)
     chosen = FrameRange.of(frames)
-    return tuple(
-        _preview(
-            examine(
-                recording, converter, poses, frames=chosen, level=layout.level, known=poses.force
-            )
-        )
-        for recording in recordings
+    examined = (
+        examine(one, converter, poses, frames=chosen, level=layout.level, known=poses.force)
+        for one in recordings
     )
+    return tuple(map(_preview, examined))
 
 
 def _preview(seen: Examined) -> RecordingPreview:
     recording, scan = seen.recording, _first_scan(seen.recording)
     mount = seen.mount or find_mount([scan.points])
-    steps = np.diff(seen.times[[handle.number for handle in recording.frames]])
+    steps = np.diff(seen.times[recording.frame_numbers])
     timed = seen.has_times and len(steps) and np.median(steps) > 0
     given = {"labels": scan.labels, "instances": scan.instances}
     points = scan.points[:, :3]

@@ -301,6 +301,11 @@ class Recording(ABC):
         """
         return []
 
+    @property
+    def frame_numbers(self) -> list[int]:
+        """The numbers of the frames, in their order."""
+        return [handle.number for handle in self.frames]
+
     @cached_property
     def vehicle_T_scan(self) -> Transform:
         """(4, 4), from the frame of the scans in the layout to that of the vehicle: the axes are

@@ -255,9 +255,7 @@ def _declared(kind: type, parameter: inspect.Parameter, hint: Any) -> OptionDecl
         isinstance(choice, str) for choice in choices
     ):
         expected = "an option of the type str, int, float, bool or a Literal of texts"
-        raise DependencyError(
-            f"{kind.__name__}: {parameter.name}", expected=expected, found=str(hint)
-        )
+        raise DependencyError(f"{kind.__name__}: {parameter.name}", expected=expected, found=hint)
     if parameter.default is parameter.empty:
         raise DependencyError(
             f"{kind.__name__}: {parameter.name}", expected="a default", found="none"

@@ -10,7 +10,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.arrays import BoolArray, IntArray, LabelArray
+from carlasc.core.arrays import BoolArray, IntArray, LabelArray, run_starts
 from carlasc.core.choices import Axes
 from carlasc.core.grids import GridSpec, mirror_grid, mirror_spec, most_frequent
 
@@ -173,7 +173,7 @@ def _any_by_target(
     values = np.moveaxis(values, axis, 0)
     result = np.zeros((size, *values.shape[1:]), np.bool_)
     cells, places = pair
-    first = np.flatnonzero(np.diff(places, prepend=-1))
+    first = run_starts(places)
     rank = np.arange(len(places)) - np.repeat(first, np.diff(first, append=len(places)))
     # no voxel of the target occurs twice in a pass
     for number in range(int(rank.max(initial=-1)) + 1):

@@ -332,7 +332,7 @@ class _ConvertedFrom:
         """Write the record of the states of now, unless they are not recorded."""
         if self.states is not None:
             own = dict(self.states)
-            numbers = [handle.number for handle in self.plan.recording.frames]
+            numbers = self.plan.recording.frame_numbers
             frames = {str(number): _GAP if number in gaps else "done" for number in numbers}
             MadeFrom(combined(sorted(own.items())), own, frames).write(self.plan.writer, CONVERSION)
         elif self._before.whole == PROVISIONAL:
@@ -374,7 +374,7 @@ class _ConvertedScans(Source):
         chosen = {path: found[path] for path in found if path in self._chosen}
         for path, sequence in chosen.items():
             conversion = self._chosen[path]
-            sequence.awaited = frozenset() if conversion.allow_gaps else conversion.failed
+            sequence.awaited = frozenset(() if conversion.allow_gaps else conversion.failed)
         return chosen
 
 
@@ -476,7 +476,7 @@ def check_arguments(source: Path, sink: Sink, split: str, grids: Grids) -> None:
             raise ArgumentError(
                 "observe",
                 expected="FromScans(...), because scans are converted",
-                found=str(grids.observe),
+                found=grids.observe,
             )
         if not sink.is_readable:
             raise ArgumentError(

@@ -273,6 +273,8 @@ class Conversion:
         steps: called after each frame of each stage.
         failures: frames that failed.
         notes: remarks about the result, one line each.
+        failed: numbers of the frames that failed.
+        changed: numbers of the frames that were not in the output already.
         allow_gaps: whether frames are finished that take labels or motion from a frame that failed.
         ground: the ground in some of its scans; None if none was found, or scans cannot be read
             back.
@@ -290,9 +292,9 @@ class Conversion:
     notes: list[str] = field(default_factory=list)
     ground: Ground | None = None
     reach_m: float = np.inf
-    _failed: set[int] = field(default_factory=set)
+    failed: set[int] = field(default_factory=set)
     _held: set[int] = field(default_factory=set)
-    _changed: set[int] = field(default_factory=set)
+    changed: set[int] = field(default_factory=set)
     _names: dict[int, frozenset[str]] = field(default_factory=dict)
     _unnumbered: int = 0
 
@@ -323,7 +325,7 @@ class Conversion:
             ConflictError: the store cannot remove frames.
         """
         plan = self.plan
-        gone = set(earlier) - {handle.number for handle in plan.recording.frames}
+        gone = set(earlier) - set(plan.recording.frame_numbers)
         if gone:
             grid = [] if plan.voxels is None else [layout.grid_folder(plan.voxels)]
             own = [f"{name}/{part}" for name in grid for part in ("labels", "counts")]
@@ -339,14 +341,9 @@ class Conversion:
                 for name in layout.SCAN_FIELDS
                 if name not in made and plan.writer.has(name, number)
             ]
-            if others and number not in self._failed:
+            if others and number not in self.failed:
                 plan.writer.remove_frames(others, [number])
-                self._changed.add(number)
-
-    @property
-    def changed(self) -> frozenset[int]:
-        """Numbers of the frames that were not in the output already."""
-        return frozenset(self._changed)
+                self.changed.add(number)
 
     @property
     def waits(self) -> bool:
@@ -354,28 +351,22 @@ class Conversion:
         return bool(self._held)
 
     @property
-    def failed(self) -> frozenset[int]:
-        """Numbers of the frames that failed."""
-        return frozenset(self._failed)
-
-    @property
     def made(self) -> int:
         """Number of frames that were converted."""
-        made = self._changed if self.plan.again else self.plan.unfinished
-        return len(made - self._failed - self._held)
+        made = self.changed if self.plan.again else self.plan.unfinished
+        return len(made - self.failed - self._held)
 
     @property
     def skipped(self) -> int:
         """Number of frames that were kept."""
-        kept = {handle.number for handle in self.plan.recording.frames} - self._failed - self._held
+        kept = set(self.plan.recording.frame_numbers) - self.failed - self._held
         return len(kept) - self.made
 
     @property
     def has_scans(self) -> bool:
         """Whether the scan of any frame exists."""
-        return any(
-            self.plan.writer.has("points", handle.number) for handle in self.plan.recording.frames
-        )
+        has = self.plan.writer.has
+        return any(has("points", number) for number in self.plan.recording.frame_numbers)
 
     def _read_scans(self) -> Mapping[int, Mapping[int, Velocity]]:
         """Read each frame once, and write its scan; return the velocities of numbered actors by
@@ -416,7 +407,7 @@ class Conversion:
                 actors.add(result.number, float(plan.times[result.number]), pose, result.actors)
                 self._unnumbered += result.unnumbered
         # otherwise, the failures are reported
-        if estimate and len(self._failed) < len(plan.recording.frames):
+        if estimate and len(self.failed) < len(plan.recording.frames):
             plan.take_estimate(fill_gaps(poses, plan.recording))
         return {} if actors is None else actors.finish()
 
@@ -466,9 +457,9 @@ class Conversion:
                         frame.number, frozenset()
                     )
                     if frame.changed:
-                        self._changed.add(frame.number)
+                        self.changed.add(frame.number)
                     if frame.failure is not None:
-                        self._failed.add(frame.number)
+                        self.failed.add(frame.number)
                         self.failures.append(
                             Failure(self.plan.recording.location, frame.number, frame.failure)
                         )
@@ -478,7 +469,7 @@ class Conversion:
     def _finish(self, velocities: Mapping[int, Mapping[int, Velocity]]) -> None:
         """Add labels, instances, boxes and flow from the motion of actors."""
         plan = self.plan
-        todo = plan.unfinished - self._failed if plan.added else set[int]()
+        todo = plan.unfinished - self.failed if plan.added else set[int]()
         waiting = {} if self.allow_gaps else self._waiting(velocities)
         self.failures += [
             Failure(
@@ -529,11 +520,11 @@ class Conversion:
                 frames.setdefault(actor, []).append(number)
         for own in frames.values():
             reach = range(min(own) - MAX_GAP, max(own) + MAX_GAP + 1)
-            failed = [number for number in sorted(self._failed) if number in reach]
+            failed = [number for number in sorted(self.failed) if number in reach]
             waiting |= dict.fromkeys(own, failed[0]) if failed else {}
         for handle in self.plan.recording.frames if self.plan.recording.has_labels else ():
             near = [] if handle.labelled else self._neighbours(handle)
-            failed = [other.number for other in near if other.number in self._failed]
+            failed = [other.number for other in near if other.number in self.failed]
             waiting |= {handle.number: failed[0]} if failed else {}
         return waiting
 
@@ -565,7 +556,7 @@ class Conversion:
         return [
             handle
             for handle in self.plan.recording.frames
-            if handle.labelled and not (self.allow_gaps and handle.number in self._failed)
+            if handle.labelled and not (self.allow_gaps and handle.number in self.failed)
         ]
 
     def _box_tracks(self) -> tuple[list[Track] | None, dict[int, Boxes]]:
@@ -574,7 +565,7 @@ class Conversion:
         if plan.boxes is None or plan.poses is None:
             return None, {}
         poses = {number: plan.poses[number] for number in plan.boxes}
-        numbers = sorted(poses.keys() | {handle.number for handle in plan.recording.frames})
+        numbers = sorted({*poses, *plan.recording.frame_numbers})
         times = {number: float(plan.times[number]) for number in numbers}
         return tracks_from_boxes(plan.boxes, poses, times), plan.boxes
 
@@ -582,11 +573,11 @@ class Conversion:
         """Find the ground in some of the scans; write the height of the sensor if the data set
         does not say it, and what was found.
         """
-        plan, frames = self.plan, [handle.number for handle in self.plan.recording.frames]
+        plan, frames = self.plan, self.plan.recording.frame_numbers
         chosen = {frames[i] for i in np.linspace(0, len(frames) - 1, _GROUND_FRAMES).astype(int)}
         scans = [
             points
-            for number in sorted(chosen - self._failed)
+            for number in sorted(chosen - self.failed)
             if plan.writer.has("points", number)
             and (points := plan.writer.read("points", number)) is not None
         ]
@@ -695,8 +686,8 @@ def _copy_images(plan: RecordingPlan, cameras: Sequence[CameraModel]) -> list[st
                     missing += 1
                     continue
                 made = {f"images.{camera.name}.{image[0]}": np.frombuffer(image[1], np.uint8)}
-                by_frame.setdefault(number, {}).update(_different(plan.writer, number, made))
-        by_frame = {number: own for number, own in by_frame.items() if own}
+                if new := _different(plan.writer, number, made):
+                    by_frame.setdefault(number, {}).update(new)
         if by_frame:
             plan.writer.write_frames(by_frame)
     note = f"{missing} images of cameras do not exist, or are neither .jpg nor .png"

@@ -92,14 +92,14 @@ class Boxes:
             array = getattr(self, name)
             if array.shape != (count, *row):
                 raise FormatError(
-                    f"boxes: {name}", expected=f"shape {(count, *row)}", found=str(array.shape)
+                    f"boxes: {name}", expected=f"shape {(count, *row)}", found=array.shape
                 )
         for name in ("tracks", "labels"):
             if getattr(self, name).dtype.kind != "u":
                 raise FormatError(
                     f"boxes: {name}",
                     expected="unsigned integers",
-                    found=str(getattr(self, name).dtype),
+                    found=getattr(self, name).dtype,
                 )
         for name in ("centers", "quaternions", "sizes"):
             self._check(name, np.isfinite(getattr(self, name)).all(axis=1), "finite numbers")

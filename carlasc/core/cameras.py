@@ -103,7 +103,7 @@ class CameraModel:
         if len(self.distortion) not in _COEFFICIENTS[self.model]:
             counts = " or ".join(map(str, _COEFFICIENTS[self.model]))
             expected = f"{counts} coefficients of distortion for {self.model}"
-            raise FormatError(where, expected=expected, found=str(len(self.distortion)))
+            raise FormatError(where, expected=expected, found=len(self.distortion))
         for name in ("width", "height"):
             if type(size := getattr(self, name)) is not int or not 0 < size <= 65536:
                 raise FormatError(
@@ -236,7 +236,7 @@ class CameraModel:
         except FormatError as error:
             raise error.within(where) from error
         except (TypeError, ValueError) as error:
-            raise FormatError(where, expected="numbers of a camera", found=str(error)) from error
+            raise FormatError(where, expected="numbers of a camera", found=error) from error
 
     @cached_property
     def _widest(self) -> float:

@@ -74,9 +74,7 @@ class ClassTable:
         where = f"class table {self.name}"
         ids = set(self.names)
         if not ids or min(ids) < 0 or max(ids) > _MAX_ID:
-            raise ArgumentError(
-                where, expected=f"names of ids 0..{_MAX_ID}", found=str(sorted(ids))
-            )
+            raise ArgumentError(where, expected=f"names of ids 0..{_MAX_ID}", found=sorted(ids))
         for expected, wrong in (
             ("a name and a colour for each id", ids ^ set(self.colors)),
             *((f"ids of the table in {role}", getattr(self, role) - ids) for role in ROLES),
@@ -96,7 +94,7 @@ class ClassTable:
                 )
         if self.num_channels and not max(self.names) < self.num_channels <= _MAX_ID + 1:
             expected = f"num_channels above {max(self.names)}, up to {_MAX_ID + 1}"
-            raise ArgumentError(where, expected=expected, found=str(self.num_channels))
+            raise ArgumentError(where, expected=expected, found=self.num_channels)
         object.__setattr__(self, "names", dict(self.names))
         object.__setattr__(self, "colors", dict(self.colors))
         object.__setattr__(self, "num_channels", self.num_channels or max(self.names) + 1)
@@ -142,7 +140,7 @@ class ClassTable:
             raise FormatError(
                 f"{where}: classes",
                 expected="names and colours by id, and ids in the roles",
-                found=str(error),
+                found=error,
             ) from error
 
     def to_dict(self) -> dict[str, Any]:

@@ -38,7 +38,7 @@ class FrameRange:
             ):
                 raise ArgumentError("frames", expected="integers or None", found=repr(bound))
         if self.start is not None and self.stop is not None and self.start >= self.stop:
-            raise ArgumentError("frames", expected="a range that holds a frame", found=str(self))
+            raise ArgumentError("frames", expected="a range that holds a frame", found=self)
 
     @classmethod
     def of(cls, frames: Frames) -> FrameRange:

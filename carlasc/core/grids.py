@@ -27,6 +27,7 @@ from carlasc.core.arrays import (
     IntArray,
     LabelArray,
     Uint8Array,
+    run_starts,
 )
 from carlasc.core.choices import Coordinates as Coordinates  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import Preset
@@ -75,7 +76,7 @@ class GridSpec:
             values = tuple(map(kind, given)) if all(map(is_finite, given)) else ()
             if len(values) != 3:
                 raise ArgumentError(
-                    f"grid {name}", expected="three finite numbers", found=str(getattr(self, name))
+                    f"grid {name}", expected="three finite numbers", found=getattr(self, name)
                 )
             object.__setattr__(self, name, values)
         if math.prod(self.size) >= 2**31:
@@ -104,7 +105,7 @@ class GridSpec:
             ),
         ):
             if wrong:
-                raise ArgumentError(f"grid {name}", expected=expected, found=str(found))
+                raise ArgumentError(f"grid {name}", expected=expected, found=found)
 
     @classmethod
     def published(cls, name: Preset | Coordinates = "coarse") -> GridSpec:
@@ -154,7 +155,7 @@ class GridSpec:
         try:
             size = [float(v) for v in params["grid_size"]]
             if any(v != int(v) for v in size):
-                raise FormatError(where, expected="integers in grid_size", found=str(size))
+                raise FormatError(where, expected="integers in grid_size", found=size)
             lower, upper = _three(params["min_bound"]), _three(params["max_bound"])
             return cls(params["coordinates"], _three(map(int, size)), lower, upper)
         except FormatError:
@@ -394,7 +395,7 @@ class Grid:
         for name, array in (("labels", self.labels), ("counts", self.counts)):
             if array is not None and array.shape != self.spec.size:
                 raise FormatError(
-                    f"grid {name}", expected=f"shape {self.spec.size}", found=str(array.shape)
+                    f"grid {name}", expected=f"shape {self.spec.size}", found=array.shape
                 )
 
     @property
@@ -457,7 +458,7 @@ def most_frequent(cells: AnyIntArray, labels: AnyIntArray) -> tuple[IntArray, In
     pairs, counts = np.unique(cells.astype(np.int64) * channels + labels, return_counts=True)
     owners = pairs // channels
     order = np.lexsort((pairs, -counts, owners))
-    best = order[np.flatnonzero(np.diff(owners[order], prepend=-1))]
+    best = order[run_starts(owners[order])]
     return owners[best], pairs[best] % channels
 
 

@@ -71,7 +71,7 @@ class Scan:
     def __post_init__(self) -> None:
         check_types(Scan, vars(self))
         if self.points.ndim != 2 or self.points.shape[1] != 3:
-            raise FormatError("scan points", expected="shape (N, 3)", found=str(self.points.shape))
+            raise FormatError("scan points", expected="shape (N, 3)", found=self.points.shape)
         count = len(self.points)
         expected = {
             "labels": (count,),
@@ -85,14 +85,14 @@ class Scan:
                 raise FormatError(
                     f"scan {name}",
                     expected=f"shape {shape} for {count} points",
-                    found=str(array.shape),
+                    found=array.shape,
                 )
         for name, array in self.others.items():
             if len(array) != count:
                 raise FormatError(
                     f"scan {name}",
                     expected=f"{count} rows for {count} points",
-                    found=str(len(array)),
+                    found=len(array),
                 )
 
     def __len__(self) -> int:

@@ -417,7 +417,7 @@ def classes_from(value: object, where: str) -> tuple[ClassTable, Remap | None]:
         raise FormatError(
             f"{where}: map",
             expected='ids by ids, or a text such as "1->7 14..19->10"',
-            found=str(error),
+            found=error,
         ) from error
 
 

@@ -236,7 +236,7 @@ def soft_labels(
     voxel, count = classes["voxel"].astype(np.int64), known.size
     if len(voxel) and not 0 <= int(voxel.min()) <= int(voxel.max()) < count:
         outside = voxel[(voxel < 0) | (voxel >= count)]
-        raise FormatError(where, expected=f"voxels 0 to {count - 1}", found=str(outside[0]))
+        raise FormatError(where, expected=f"voxels 0 to {count - 1}", found=outside[0])
     label = label_map(np.ascontiguousarray(classes["label"]), where).astype(np.int64)
     p = np.where(known, occupied, 0).astype(np.float32).reshape(-1)
     posterior = np.zeros((max(label_map.target.names) + 1, count), np.float32)

@@ -182,9 +182,7 @@ class Dataset(_MapStyle):
         check_types(Dataset.__init__, locals())
         self.fields = _check_fields(fields)
         if history < 1:
-            raise ArgumentError(
-                "history", expected="a number of scans of 1 or more", found=str(history)
-            )
+            raise ArgumentError("history", expected="a number of scans of 1 or more", found=history)
         self.history = int(history)
         self.align = align
         self._grid_fields = GridFields(frozenset(self.fields), inferred, min_confidence)
@@ -311,7 +309,7 @@ class Dataset(_MapStyle):
         """Return a Dataset of a slice of the samples."""
         if chosen.step is not None and chosen.step < 0:
             raise ArgumentError(
-                "index", expected="a slice with a step of 1 or more", found=str(chosen.step)
+                "index", expected="a slice with a step of 1 or more", found=chosen.step
             )
         part, places = copy.copy(self), np.arange(len(self))[chosen]
         ends = zip(self._starts[:-1].tolist(), self._starts[1:].tolist(), self._parts, strict=True)

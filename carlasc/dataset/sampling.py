@@ -16,7 +16,6 @@ import zlib
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -126,10 +125,10 @@ class ShardSampler(_Sampler):
         }
         for name, (value, least) in given.items():
             if value < least:
-                raise ArgumentError(name, expected=f"{least} or more", found=str(value))
+                raise ArgumentError(name, expected=f"{least} or more", found=value)
         if rank >= num_replicas:
             expected = f"0 to {num_replicas - 1}, for {num_replicas} processes"
-            raise ArgumentError("rank", expected=expected, found=str(rank))
+            raise ArgumentError("rank", expected=expected, found=rank)
         self.dataset = dataset
         self.seed = seed
         self.epoch = 0
@@ -232,7 +231,7 @@ class ShardSampler(_Sampler):
             raise ArgumentError(
                 "state",
                 expected=f"the state of a ShardSampler with {self._about()}",
-                found=str({name: state.get(name) for name in different or ("position",)}),
+                found={name: state.get(name) for name in different or ("position",)},
                 advice="the data and the arguments `shard` and `window` must be the same",
             )
         self.seed, self.epoch = int(state["seed"]), int(state["epoch"])
@@ -338,12 +337,7 @@ class ReadAhead:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         with self._changed:
             self._stopped = True
             self._changed.notify_all()

@@ -106,7 +106,7 @@ class SequenceFrames:
             raise FormatError(
                 f"{where}, line {line + 1}",
                 expected="a rigid transform",
-                found=str(poses[line, :3].ravel().tolist()),
+                found=poses[line, :3].ravel().tolist(),
             )
 
 
@@ -220,7 +220,7 @@ def common_value(values: Mapping[str, _T], what: str, advice: str = "") -> _T:
             raise FormatError(
                 other,
                 expected=f"the {what} of {place} ({value})",
-                found=str(theirs),
+                found=theirs,
                 advice=" or ".join(
                     filter(
                         None,

@@ -108,9 +108,9 @@ class Augment:
             ("drop", drop, 1.0),
         ):
             if not 0 <= value <= most:
-                raise ArgumentError(name, expected=f"0..{most:g}", found=str(value))
+                raise ArgumentError(name, expected=f"0..{most:g}", found=value)
         if seed is not None and seed < 0:
-            raise ArgumentError("seed", expected="0 or more", found=str(seed))
+            raise ArgumentError("seed", expected="0 or more", found=seed)
         if not set(directions) <= set(_DIRECTIONS):
             raise ArgumentError("directions", expected="x, y or both", found=repr(directions))
         self.directions = tuple(directions)
@@ -121,7 +121,7 @@ class Augment:
         shift = _numbers("translate_m", translate_m)
         self.translate_m = (shift[0], shift[0], 0.0) if len(shift) == 1 else shift
         if len(self.translate_m) != 3:
-            raise ArgumentError("translate_m", expected="one or three lengths", found=str(shift))
+            raise ArgumentError("translate_m", expected="one or three lengths", found=shift)
         self._chooses = not isinstance(rotate_rad, Real)
         self.drop = drop
         self.seed = seed

@@ -6,13 +6,13 @@ from .options import FromGrid as FromGrid
 from .options import FromScans as FromScans
 from .options import GridOptions as GridOptions
 from .options import Observe as Observe
+from .options import VoteRule as VoteRule
 from .options import Voting as Voting
 from .run import FrameFailure as FrameFailure
 from .run import RegridResult as RegridResult
 from .run import regrid as regrid
 from .voting.ballot import Ballot as Ballot
 from .voting.ballot import Observation as Observation
-from .voting.ballot import VoteRule as VoteRule
 from .voting.ballot import Votes as Votes
 from .voting.ballot import count_votes as count_votes
 from .voting.certainty import VoxelCertainty as VoxelCertainty

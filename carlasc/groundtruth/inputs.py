@@ -21,9 +21,9 @@ from carlasc.core.choices import CompareInputs
 from carlasc.core.frames import FrameRange
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.errors import ArgumentError, CarlascError, MissingDataError, count
-from carlasc.groundtruth.options import FromGrid, FromScans, Observe, Voting
+from carlasc.groundtruth.options import FromGrid, FromScans, Observe, VoteRule, Voting
 from carlasc.groundtruth.reporting import PoseFacts, Residual
-from carlasc.groundtruth.voting.ballot import VoteRule, Votes
+from carlasc.groundtruth.voting.ballot import Votes
 from carlasc.groundtruth.voting.certainty import VoxelCertainty
 from carlasc.groundtruth.voxel_actors import VoxelActors
 from carlasc.running.spreading import Run, StepCounter
@@ -259,11 +259,7 @@ class SequenceInput(ABC):
         no scan can be read.
         """
         frames = self.frames
-        chosen = {
-            frames[0].source_frame,
-            frames[len(frames) // 2].source_frame,
-            frames[-1].source_frame,
-        }
+        chosen = {frames[place].source_frame for place in (0, len(frames) // 2, -1)}
         counts = []
         for frame in sorted(chosen):
             try:

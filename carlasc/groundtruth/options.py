@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
 from carlasc.core.choices import Complete as Complete  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import Dynamic as Dynamic  # noqa: PLC0414 (part of this module)
+from carlasc.core.choices import VoteRule as VoteRule  # noqa: PLC0414 (part of this module)
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, check_choice, check_types
-from carlasc.groundtruth.voting.ballot import VoteRule, check_rule
 from carlasc.motion.options import MotionOptions, PoseOptions
 
 if TYPE_CHECKING:
@@ -79,10 +79,10 @@ class FromScans:
                 found=f"{first}:{last}",
             )
         if self.stride < 1:
-            raise ArgumentError("stride", expected="at least 1", found=str(self.stride))
+            raise ArgumentError("stride", expected="at least 1", found=self.stride)
         if self.window_m is not None and not self.window_m > 0:
             raise ArgumentError(
-                "window_m", expected="a positive number of metres", found=str(self.window_m)
+                "window_m", expected="a positive number of metres", found=self.window_m
             )
         check_choice("dynamic", self.dynamic, Dynamic)
         check_choice("complete", self.complete, Complete)
@@ -126,6 +126,20 @@ Observe = FromCapture | FromScans | FromGrid
 """The type of the argument `observe` of `regrid`."""
 
 
+def check_rule(rule: str, free_step_m: float) -> None:
+    """Check the rule and the distance of free samples.
+
+    Raises:
+        ArgumentError: an unknown rule, or a distance that is not positive.
+    """
+    if rule not in get_args(VoteRule):
+        raise ArgumentError("rule", expected="sensor, sample or ray", found=repr(rule))
+    if not (math.isfinite(free_step_m) and free_step_m > 0):
+        raise ArgumentError(
+            "free_step_m", expected="a positive number of metres", found=free_step_m
+        )
+
+
 @dataclass(frozen=True)
 class Voting:
     """How votes are counted.
@@ -167,7 +181,7 @@ class Voting:
             raise ArgumentError(
                 "min_confidence",
                 expected="a probability from 0 to below 1",
-                found=str(self.min_confidence),
+                found=self.min_confidence,
             )
 
 

@@ -280,10 +280,11 @@ class FrameFacts:
         digests = {name: digest_of(name, array) for name, array in arrays.items()}
         labels = np.asarray(arrays[f"{grid}/labels"]).reshape(-1)
         counts = arrays.get(f"{grid}/counts")
-        votes, votes_sum = np.zeros(POWERS, np.int64), 0.0
+        votes, votes_sum, known = np.zeros(POWERS, np.int64), 0.0, np.ones(len(labels), np.bool_)
         if counts is not None:
             seen = np.asarray(counts).reshape(-1)
-            labels, seen = labels[seen > 0], seen[seen > 0]
+            known = seen > 0
+            labels, seen = labels[known], seen[known]
             powers = np.clip(np.frexp(seen.astype(np.float32))[1] - 1, 0, POWERS - 1)
             votes, votes_sum = (
                 np.bincount(powers, minlength=POWERS),
@@ -294,7 +295,6 @@ class FrameFacts:
         by_class = np.bincount(labels, minlength=classes.num_channels)
         inferred = None
         if (flags := arrays.get(f"{grid}/flags")) is not None:
-            known = True if counts is None else np.asarray(counts).reshape(-1) > 0
             marked = np.asarray(flags).reshape(-1) & int(VoxelFlag.INFERRED) > 0
             inferred = int(np.count_nonzero(marked & known))
         return cls(

@@ -197,7 +197,7 @@ def regrid(
             _begin(job)
             job.announce()
             open_things.enter_context(job.writer)
-        work = Work(jobs, plan, pool)
+        work = Work(jobs, pool)
         failures = work.run()
         if boxes_out is not None:
             (one,) = merged.values()
@@ -343,12 +343,12 @@ def _prepare(
 def settings_of(inputs: SequenceInput, plan: GridPlan) -> dict[str, Any]:
     """Return the params.json of the grid of a sequence, as a later run reads it."""
     how = {"free_step_m": float(plan.voting.free_step_m), "voting": plan.rule}
-    how |= (
-        {"min_confidence": float(plan.voting.min_confidence)} if plan.voting.min_confidence else {}
-    )
+    if plan.voting.min_confidence:
+        how["min_confidence"] = float(plan.voting.min_confidence)
     made_from = inputs.record()
     record = {"format": RECORD_FORMAT, "rule": RULES[made_from["observe"]], **made_from, **how}
-    record |= {"labels": inputs.metadata.predicted} if inputs.metadata.predicted else {}
+    if inputs.metadata.predicted:
+        record["labels"] = inputs.metadata.predicted
     settings = plan.spec.to_params(inputs.metadata.classes.num_channels) | {RECORD: record}
     return parse_json(to_json(settings), plan.grid)
 
@@ -480,9 +480,9 @@ class FrameTask:
         names = (*layout.SCAN_FIELDS, *(f"{plan.grid}/{part}" for part in layout.GRID_FIELDS))
         with reading(f"frame {self.number}", "a grid with labels and counts"):
             for name in names:
-                if writer.has(name, self.number):
-                    array = writer.read(name, self.number)
-                    arrays |= {} if array is None else {name: array}
+                has = writer.has(name, self.number)
+                if has and (array := writer.read(name, self.number)) is not None:
+                    arrays[name] = array
             labels, counts = (
                 arrays[f"{plan.grid}/{part}"].reshape(plan.spec.size)
                 for part in ("labels", "counts")
@@ -695,13 +695,14 @@ class SequenceJob:
         grid, writer, documents = self.plan.grid, self.writer, self._documents()
         if facts:
             inputs = self.inputs
-            classes, actors, poses = (
-                inputs.metadata.classes,
-                inputs.summaries(),
-                inputs.pose_facts(),
-            )
             report = Report.make(
-                grid, facts, self.params, classes, documents, actors=actors, poses=poses
+                grid,
+                facts,
+                self.params,
+                inputs.metadata.classes,
+                documents,
+                actors=inputs.summaries(),
+                poses=inputs.pose_facts(),
             )
             writer.write_document(layout.report_file(grid), report.to_json())
 
@@ -712,7 +713,6 @@ class Work:
 
     Attributes:
         jobs: the sequences.
-        plan: the plan of the run.
         spread: how the work is spread. Frames that are stored together are in one part.
         failures: frames that could not be made.
         wanted: number of frames to make.
@@ -721,7 +721,6 @@ class Work:
     """
 
     jobs: Series[SequenceJob]
-    plan: GridPlan
     spread: Run
     failures: list[FrameFailure] = field(default_factory=list)
     wanted: int = 0
@@ -791,15 +790,16 @@ class Work:
             job.check.begin(job.numbers, ())
         is_reported = not made and job.is_reported()
         if not (is_reported or (self.spread.part.count > 1 and job.missing())):
-            self._report(job, made, {done.task.number for done in made})
+            self._report(job, made)
         if made or job.check.must_record:
             job.check.finish({done.task.number for done in made if done.error is None})
 
-    def _report(self, job: SequenceJob, made: list[FrameResult], tried: Set[int]) -> None:
+    def _report(self, job: SequenceJob, made: list[FrameResult]) -> None:
         """Write the report of a sequence."""
         job.inputs.prepare(job.writer, self.spread, StepCounter(None))
         self.has_written = True
-        measured = _batches(job, job.tasks(job.reported - tried, job.writer), Run(1))
+        others = job.reported - {done.task.number for done in made}
+        measured = _batches(job, job.tasks(others, job.writer), Run(1))
         with closing(run_all(run_batch, measured, self.spread, lost=fail_batch)) as results:
             job.write_report([*made, *(done for batch in results for done in batch)])
 

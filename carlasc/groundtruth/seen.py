@@ -183,15 +183,10 @@ def _reach_points(points, eye, solid, reached):  # type: ignore[no-untyped-def]
                     edge = 1e-9 if at < 0 else last - 1e-9
                     share = (edge - at) / ray if ray != 0 else 2.0
                     first = max(first, share if share > 0 else 2.0)
-            if first >= 1.0:
-                reached[n] = True
-                break
             at_x, at_y, at_z = at_x + first * ray_x, at_y + first * ray_y, at_z + first * ray_z
             x, y, z = int(np.floor(at_x)), int(np.floor(at_y)), int(np.floor(at_z))
-            if x < 0 or y < 0 or z < 0 or x >= size[0] or y >= size[1] or z >= size[2]:
-                reached[n] = True
-                break
-            if _reaches((at_x, at_y, at_z), eye, (x, y, z), solid):
+            is_outside = x < 0 or y < 0 or z < 0 or x >= size[0] or y >= size[1] or z >= size[2]
+            if first >= 1.0 or is_outside or _reaches((at_x, at_y, at_z), eye, (x, y, z), solid):
                 reached[n] = True
                 break
 
@@ -209,9 +204,9 @@ def _reaches(at, eye, cell, solid):  # type: ignore[no-untyped-def]
     each_x = abs(1.0 / ray_x) if ray_x != 0 else np.inf
     each_y = abs(1.0 / ray_y) if ray_y != 0 else np.inf
     each_z = abs(1.0 / ray_z) if ray_z != 0 else np.inf
-    next_x = ((x + (1 if ray_x > 0 else 0)) - at[0]) / ray_x if ray_x != 0 else np.inf
-    next_y = ((y + (1 if ray_y > 0 else 0)) - at[1]) / ray_y if ray_y != 0 else np.inf
-    next_z = ((z + (1 if ray_z > 0 else 0)) - at[2]) / ray_z if ray_z != 0 else np.inf
+    next_x = (x + (ray_x > 0) - at[0]) / ray_x if ray_x != 0 else np.inf
+    next_y = (y + (ray_y > 0) - at[1]) / ray_y if ray_y != 0 else np.inf
+    next_z = (z + (ray_z > 0) - at[2]) / ray_z if ray_z != 0 else np.inf
     while True:
         if next_x <= next_y and next_x <= next_z:
             if next_x >= 1.0:

@@ -20,6 +20,7 @@ from carlasc.core.arrays import (
     LabelArray,
     RecordArray,
     Uint32Array,
+    run_starts,
 )
 from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
@@ -129,7 +130,7 @@ class ActorPoints:
         counts = self._counts
         counts = counts[counts["label"] == labels.reshape(-1)[counts["voxel"]]]
         best = counts[np.lexsort((counts["actor"], -counts["points"], counts["voxel"]))]
-        best = best[np.flatnonzero(np.diff(best["voxel"], prepend=-1))]
+        best = best[run_starts(best["voxel"])]
         instance = np.zeros(self.spec.num_voxels, np.uint32)
         instance[best["voxel"]] = best["actor"]
         known = best[np.isin(best["actor"], list(self._velocity)) & (best["actor"] > 0)]

@@ -30,6 +30,7 @@ from carlasc.groundtruth.from_scans.sequences import (
 from carlasc.groundtruth.inputs import GridPlan
 from carlasc.inspection.findings import State
 from carlasc.inspection.heldout_scores import HeldOutScores
+from carlasc.metrics.casting import check_cartesian
 from carlasc.motion.options import PoseOptions
 from carlasc.motion.tracks import MovingActors
 from carlasc.running.processes import run_all
@@ -164,11 +165,8 @@ def holdout(
     existing, made = _existing_grid(as_source(source))
     spec, observe = spec or existing, observe or made
     if every < 2:
-        raise ArgumentError("every", expected="2 or more", found=str(every))
-    if spec.coordinates != "cartesian":
-        raise ArgumentError(
-            "grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates
-        )
+        raise ArgumentError("every", expected="2 or more", found=every)
+    check_cartesian(spec)
     plan = GridPlan(spec, layout.grid_folder(spec), observe, voting, FrameRange.of(frames))
     inputs = [
         sequence

@@ -250,7 +250,7 @@ def stats(
     """
     check_types(stats, locals())
     if every < 1:
-        raise ArgumentError("every", expected="1 or more", found=str(every))
+        raise ArgumentError("every", expected="1 or more", found=every)
     opened = as_source(source)
     chosen, places = sample_of(opened, sample)
     sequences = source_in(opened, chosen).sequences()

@@ -180,7 +180,7 @@ def validate(
     """
     check_types(validate, locals())
     if every is not None and every < 1:
-        raise ArgumentError("every", expected="1 or more", found=str(every))
+        raise ArgumentError("every", expected="1 or more", found=every)
     opened = as_source(source)
     chosen, places = sample_of(opened, sequences, name="sequences")
     some = source_in(opened, chosen).sequences().values()

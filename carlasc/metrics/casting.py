@@ -70,22 +70,19 @@ def cast_rays(
     Raises:
         ArgumentError: the grid is cylindrical, or the shapes do not match.
     """
-    _check_cartesian(spec)
+    check_cartesian(spec)
     if grids.ndim != 4 or grids.shape[1:] != spec.size:
         raise ArgumentError(
-            "grids", expected=f"shape (G, {', '.join(map(str, spec.size))})", found=str(grids.shape)
+            "grids", expected=f"shape (G, {', '.join(map(str, spec.size))})", found=grids.shape
         )
-    starts, lower, voxel = (
-        np.asarray(origins, np.float64).reshape(-1, 3),
-        np.array(spec.lower),
-        spec.voxel_size,
-    )
+    starts = np.asarray(origins, np.float64).reshape(-1, 3)
+    lower, voxel = np.array(spec.lower), spec.voxel_size
     steps = np.asarray(directions, np.float64).reshape(-1, 3)
     solid = np.zeros(grids.shape[1:], np.uint8)
     for bit, grid in enumerate(grids):
         solid |= (grid != free).astype(np.uint8) << np.uint8(bit)
     if len(grids) > 8:
-        raise ArgumentError("grids", expected="at most 8 grids", found=str(len(grids)))
+        raise ArgumentError("grids", expected="at most 8 grids", found=len(grids))
     voxels = np.full((len(grids), len(starts) * len(steps)), -1, np.int64)
     depth = np.zeros(voxels.shape)
     _cast(
@@ -99,7 +96,8 @@ def cast_rays(
     return voxels, depth
 
 
-def _check_cartesian(spec: GridSpec) -> None:
+def check_cartesian(spec: GridSpec) -> None:
+    """Check that rays can be cast through a grid."""
     if spec.coordinates != "cartesian":
         raise ArgumentError(
             "grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates
@@ -130,7 +128,7 @@ def follow_rays(
     Raises:
         ArgumentError: the grid is cylindrical.
     """
-    _check_cartesian(spec)
+    check_cartesian(spec)
     ends, lower, voxel = np.asarray(points, np.float64), np.array(spec.lower), spec.voxel_size
     first, passed = np.full(len(ends), np.inf), np.zeros(len(ends), np.uint8)
     start, size = (np.asarray(origin, np.float64) - lower) / voxel, np.array(spec.size)

@@ -69,13 +69,13 @@ class ConfusionMatrix(Summed):
                 another shape.
         """
         if num_classes < 1:
-            raise ArgumentError("num_classes", expected="1 or more", found=str(num_classes))
+            raise ArgumentError("num_classes", expected="1 or more", found=num_classes)
         check_free(free, num_classes)
         if counts is not None and np.shape(counts) != (num_classes, num_classes):
             raise ArgumentError(
                 "counts",
                 expected=f"the shape {(num_classes, num_classes)}",
-                found=str(np.shape(counts)),
+                found=np.shape(counts),
             )
         self.num_classes = num_classes
         self.free = free
@@ -105,7 +105,7 @@ class ConfusionMatrix(Summed):
                 raise FormatError(
                     name,
                     expected=f"the shape of the ground truth {tuple(np.shape(truth))}",
-                    found=str(tuple(np.shape(array))),
+                    found=tuple(np.shape(array)),
                 )
         device = device_of(prediction, truth, mask)
         if device is None:  # torch tensors on the CPU convert to NumPy without a copy
@@ -211,8 +211,7 @@ class ConfusionMatrix(Summed):
         """
         check_choice("absent", absent, Absent)
         iou = self.iou if with_free else np.delete(self.iou, self.free)
-        iou = np.nan_to_num(iou) if absent == "zero" else iou[~np.isnan(iou)]
-        return float(iou.mean()) if len(iou) else float("nan")
+        return mean_of(np.nan_to_num(iou) if absent == "zero" else iou)
 
     @property
     def accuracy(self) -> float:
@@ -224,17 +223,13 @@ class ConfusionMatrix(Summed):
         occupied = np.arange(self.num_classes) != self.free
         hit = self.counts[np.ix_(occupied, occupied)].sum()
         predicted, true = self.counts[:, occupied].sum(), self.counts[occupied].sum()
-        return Completeness(
-            float(ratio(hit, predicted)),
-            float(ratio(hit, true)),
-            float(ratio(hit, predicted + true - hit)),
-        )
+        return Completeness(*ratio([hit] * 3, [predicted, true, predicted + true - hit]).tolist())
 
 
 def check_free(free: int, num_classes: int) -> None:
     """Raise ArgumentError if the id of free space is not in 0..K-1."""
     if not 0 <= free < num_classes:
-        raise ArgumentError("free", expected=f"a class id in 0..{num_classes - 1}", found=str(free))
+        raise ArgumentError("free", expected=f"a class id in 0..{num_classes - 1}", found=free)
 
 
 def ratio(numerator: Any, denominator: Any) -> FloatArray:
@@ -243,6 +238,12 @@ def ratio(numerator: Any, denominator: Any) -> FloatArray:
     return np.divide(
         numerator, denominator, out=np.full(denominator.shape, np.nan), where=denominator > 0
     )
+
+
+def mean_of(values: FloatArray) -> float:
+    """Return the mean of the values that are not NaN; NaN if there are none."""
+    present = values[~np.isnan(values)]
+    return float(present.mean()) if present.size else float("nan")
 
 
 def json_number(value: float) -> float | None:
@@ -350,7 +351,7 @@ def count_arrays(
     """
     for name, labels in (("prediction", prediction), ("truth", truth)):
         if labels.dtype.kind not in "uib":
-            raise FormatError(name, expected="integer class ids", found=str(labels.dtype))
+            raise FormatError(name, expected="integer class ids", found=labels.dtype)
     prediction, truth = (np.ascontiguousarray(labels).reshape(-1) for labels in (prediction, truth))
     counted = (
         np.ones(prediction.shape, np.bool_)
@@ -403,7 +404,12 @@ def _in_range(labels: AnyArray, counted: BoolArray, num_classes: int, name: str)
         return labels
     wrong = ((labels < 0) | (labels >= num_classes)) & counted
     if wrong.any():
-        raise _out_of_range(name, int(labels[wrong][0]), int(wrong.sum()), num_classes)
+        raise FormatError(
+            name,
+            expected=f"class ids 0..{num_classes - 1}",
+            found=f"{int(labels[wrong][0])} ({wrong.sum()} voxels are out of range)",
+            advice="remap the labels, or mask these voxels",
+        )
     return np.where(counted, labels, 0)
 
 
@@ -465,12 +471,3 @@ def flat_sides(
     check_ids("prediction", arrays[0], num_classes)
     check_ids("truth", arrays[2], num_classes)
     return arrays
-
-
-def _out_of_range(name: str, found: int, times: int, num_classes: int) -> FormatError:
-    return FormatError(
-        name,
-        expected=f"class ids 0..{num_classes - 1}",
-        found=f"{found} ({times} voxels are out of range)",
-        advice="remap the labels, or mask these voxels",
-    )

@@ -566,6 +566,6 @@ def _read(pair: Pair, frame: int, predicted: set[int]) -> LabelPair:
         raise FormatError(
             where,
             expected=f"the shape of the ground truth {truth.shape}",
-            found=str(prediction.shape),
+            found=prediction.shape,
         )
     return prediction.reshape(truth.shape), truth, cache(partial(pair.truth.known, frame))

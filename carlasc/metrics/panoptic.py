@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from carlasc.core.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from carlasc.core.compiling import cached
 from carlasc.errors import ArgumentError, check_choice
-from carlasc.metrics.confusion import flat_sides, ratio
+from carlasc.metrics.confusion import flat_sides, mean_of, ratio
 from carlasc.metrics.scoring import Summed
 
 Variant = Literal["standard", "pasco"]
@@ -49,12 +49,9 @@ class PanopticScore:
         """Return the mean over the occurring classes: all, only things, or only stuff; NaN if none
         occurs.
         """
-        values = getattr(self, what)
-        is_thing = np.isin(np.arange(len(values)), sorted(self.things))
-        keep = {"all": np.ones_like(is_thing), "things": is_thing, "stuff": ~is_thing}[
-            which
-        ] & ~np.isnan(self.pq)
-        return float(values[keep].mean()) if keep.any() else float("nan")
+        is_thing = np.isin(np.arange(len(self.pq)), sorted(self.things))
+        keep = {"all": True, "things": is_thing, "stuff": ~is_thing}[which] & ~np.isnan(self.pq)
+        return mean_of(getattr(self, what)[keep])
 
     @property
     def pq_dagger(self) -> float:
@@ -62,8 +59,7 @@ class PanopticScore:
         CVPR 2019).
         """
         is_thing = np.isin(np.arange(len(self.pq)), sorted(self.things))
-        values = np.where(is_thing, self.pq, self.iou)[~np.isnan(self.pq)]
-        return float(values.mean()) if len(values) else float("nan")
+        return mean_of(np.where(is_thing, self.pq, self.iou)[~np.isnan(self.pq)])
 
 
 @dataclass(frozen=True)
@@ -122,7 +118,7 @@ class PanopticQuality(Summed):
             raise ArgumentError(
                 "things",
                 expected=f"class ids below {num_classes} other than free",
-                found=str(sorted(things)),
+                found=sorted(things),
             )
         self.num_classes, self.things = num_classes, frozenset(things)
         self.free, self.variant = free, variant
@@ -170,13 +166,11 @@ class PanopticQuality(Summed):
         k = self.num_classes
         self.counts[0] += np.bincount(segments.true_class[true[hit]], minlength=k)
         self.iou_sum += np.bincount(segments.true_class[true[hit]], iou[hit], minlength=k)
-        for row, (classes, size, matched) in enumerate(
-            (
-                (segments.pred_class, segments.pred_size, pred[hit]),
-                (segments.true_class, segments.true_size, true[hit]),
-            ),
-            1,
-        ):
+        sides = (
+            (segments.pred_class, segments.pred_size, pred[hit]),
+            (segments.true_class, segments.true_size, true[hit]),
+        )
+        for row, (classes, size, matched) in enumerate(sides, 1):
             missed = size >= fewest
             missed[matched] = False
             self.counts[row] += np.bincount(classes[missed], minlength=k)

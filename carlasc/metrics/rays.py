@@ -19,7 +19,7 @@ from carlasc.core.geometry import Transform, invert
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.metrics.casting import cast_rays, rayiou_directions
-from carlasc.metrics.confusion import check_free, check_ids, ratio, to_numpy
+from carlasc.metrics.confusion import check_free, check_ids, mean_of, ratio, to_numpy
 from carlasc.metrics.panoptic import PanopticQuality, PanopticScore, match_segments
 from carlasc.metrics.scoring import Summed
 
@@ -78,12 +78,12 @@ class RayScore:
     def by_threshold(self) -> dict[float, float]:
         """RayIoU by threshold, metres: the mean over the occurring classes except free."""
         things = np.delete(self.class_iou, self.free, axis=1)
-        return {t: _mean(row) for t, row in zip(THRESHOLDS_M, things, strict=True)}
+        return {t: mean_of(row) for t, row in zip(THRESHOLDS_M, things, strict=True)}
 
     @property
     def rayiou(self) -> float:
         """Mean RayIoU over the thresholds."""
-        return _mean(np.delete(self.class_iou, self.free, axis=1))
+        return mean_of(np.delete(self.class_iou, self.free, axis=1))
 
 
 class RayIoU(Summed):
@@ -183,7 +183,7 @@ class RayIoU(Summed):
     def _check(self, labels: ArrayLike, name: str, spec: GridSpec) -> AnyArray:
         array = to_numpy(labels)
         if array.shape != spec.size:
-            raise FormatError(name, expected=f"shape {spec.size}", found=str(array.shape))
+            raise FormatError(name, expected=f"shape {spec.size}", found=array.shape)
         check_ids(name, array, self.num_classes)
         return array.astype(np.uint16, copy=False)
 
@@ -287,8 +287,3 @@ def _first_surfaces(
     valid = (voxels[1] >= 0) & (grids[1].reshape(-1)[voxels[1]] != metric.free)
     valid &= voxels[-1] == voxels[1] if len(grids) > 2 else True
     return voxels[0][valid], voxels[1][valid], np.abs(depths[0] - depths[1])[valid]
-
-
-def _mean(values: FloatArray) -> float:
-    present = values[~np.isnan(values)]
-    return float(present.mean()) if present.size else float("nan")

@@ -108,7 +108,7 @@ def height_bands(spec: GridSpec, edges_m: Sequence[float]) -> Masks:
     """
     if len(edges_m) < 2 or any(low >= high for low, high in pairwise(edges_m)):
         raise ArgumentError(
-            "edges_m", expected="two or more increasing heights", found=str(list(edges_m))
+            "edges_m", expected="two or more increasing heights", found=list(edges_m)
         )
     height = spec.centers()[..., 2]
     return {

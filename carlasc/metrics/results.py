@@ -225,11 +225,14 @@ class Evaluation:
         if not self.breakdown:
             return tables
         rows: list[tuple[Cell, ...]] = [
-            (name, *_percent(*_figures_of(self.convention.score(matrix)).values()))
-            for name, matrix in self.breakdown.items()
+            (name, *_percent(*part.values())) for name, part in self._by_region().items()
         ]
         header = ("Region", "mIoU", "Precision", "Recall", "IoU", "False free")
         return (*tables, FigureTable("By region", header, tuple(rows)))
+
+    def _by_region(self) -> dict[str, dict[str, float]]:
+        scores = {name: self.convention.score(matrix) for name, matrix in self.breakdown.items()}
+        return {name: _figures_of(score) for name, score in scores.items()}
 
     def _actor_tables(self) -> tuple[FigureTable, ...]:
         """Return the table of panoptic quality and LSTQ, if actors were scored."""
@@ -239,21 +242,10 @@ class Evaluation:
         present = [label for label in sorted(names) if not math.isnan(score.pq[label])]
         lstq = (self.actors.tracking.lstq, self.actors.tracking.association)
         row = _percent(*score.pq[present].tolist(), score.mean(), score.mean(which="things"), *lstq)
-        header = (
-            "Network",
-            *(names[label] for label in present),
-            "PQ",
-            "PQ of things",
-            "LSTQ",
-            "S_assoc",
-        )
-        return (
-            FigureTable(
-                "Actors: panoptic quality of each class, and over time",
-                header,
-                ((self.name, *row),),
-            ),
-        )
+        figures = ("PQ", "PQ of things", "LSTQ", "S_assoc")
+        header = ("Network", *(names[label] for label in present), *figures)
+        title = "Actors: panoptic quality of each class, and over time"
+        return (FigureTable(title, header, ((self.name, *row),)),)
 
     def to_csv(self) -> str:
         """Return the scores of each frame as CSV."""
@@ -296,10 +288,7 @@ class Evaluation:
             "actors": None if self.actors is None else self.actors.to_dict(self.classes),
             "breakdown": {
                 name: {key: json_number(part[key]) for key in ("miou", "iou", "false_free")}
-                for name, part in (
-                    (name, _figures_of(self.convention.score(matrix)))
-                    for name, matrix in self.breakdown.items()
-                )
+                for name, part in self._by_region().items()
             },
             "confusion": self.matrix.counts.tolist(),
             "notes": list(self.notes),
@@ -530,7 +519,7 @@ def _check_number(sequences: int) -> None:
         raise ArgumentError(
             "sequences",
             expected=f"at least {_FEWEST_SEQUENCES} sequences",
-            found=str(sequences),
+            found=sequences,
         )
 
 

@@ -12,11 +12,12 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from carlasc.core.arrays import BoolArray, IntArray
+from carlasc.core.arrays import BoolArray
+from carlasc.core.classes import ids_in
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import Grid
 from carlasc.errors import FormatError
-from carlasc.metrics.confusion import ConfusionMatrix, flat_sides, ratio
+from carlasc.metrics.confusion import ConfusionMatrix, flat_sides, mean_of
 from carlasc.metrics.scoring import Summed
 
 
@@ -90,7 +91,7 @@ class Consistency(Summed):
             raise FormatError(
                 "later",
                 expected=f"the geometry of the earlier frame, {earlier.spec}",
-                found=str(later.spec),
+                found=later.spec,
             )
         before = moved_grid(earlier, later_T_earlier)
         movable = sorted(self.moving)
@@ -131,7 +132,7 @@ def shape_consistency(earlier: BoolArray, later: BoolArray) -> float:
         FormatError: shapes differ.
     """
     if earlier.shape != later.shape:
-        raise FormatError("later", expected=f"shape {earlier.shape}", found=str(later.shape))
+        raise FormatError("later", expected=f"shape {earlier.shape}", found=later.shape)
     union = int(np.count_nonzero(earlier | later))
     return np.count_nonzero(earlier & later) / union if union else float("nan")
 
@@ -221,16 +222,16 @@ class TrackingQuality(Summed):
         pred_class, pred, true_class, true = (array[counted].astype(np.int64) for array in arrays)
         k = self.num_classes
         self.confusion += np.bincount(pred_class * k + true_class, minlength=k * k).reshape(k, k)
-        for number, size in _counts(pred[(pred > 0) & ~np.isin(pred_class, sorted(self.ignored))]):
+        scored = pred[(pred > 0) & ~np.isin(pred_class, sorted(self.ignored))]
+        for number, size in ids_in(scored).items():
             self.predicted[sequence, number] += size
         for label in self.things:
             of_class = (true_class == label) & (true > 0)
-            for number, size in _counts(true[of_class]):
+            for number, size in ids_in(true[of_class]).items():
                 if size > self.fewest:
                     self.true[sequence, label, number] += size
-                    for predicted_number, common in _counts(
-                        pred[of_class & (true == number) & (pred > 0)]
-                    ):
+                    beside = pred[of_class & (true == number) & (pred > 0)]
+                    for predicted_number, common in ids_in(beside).items():
                         self.common[sequence, label, number, predicted_number] += common
         return self
 
@@ -242,16 +243,10 @@ class TrackingQuality(Summed):
             if predicted:
                 sums[sequence, label, number] += common * common / (true + predicted - common)
         quality = [total / self.true[key] for key, total in sums.items()]
-        association = float(np.mean(quality)) if quality else float("nan")
-        hit = self.confusion.diagonal()
-        iou = ratio(hit, self.confusion.sum(axis=0) + self.confusion.sum(axis=1) - hit)
+        association = mean_of(np.array(quality))
+        iou = ConfusionMatrix(self.num_classes, counts=self.confusion).iou
         iou = np.delete(iou, sorted(self.unaveraged | self.ignored))
         classification = float(np.nanmean(iou)) if (~np.isnan(iou)).any() else float("nan")
         return TrackingScore(
             float(np.sqrt(association * classification)), association, classification, len(quality)
         )
-
-
-def _counts(numbers: IntArray) -> list[tuple[int, int]]:
-    values, sizes = np.unique(numbers, return_counts=True)
-    return list(zip(values.tolist(), sizes.tolist(), strict=True))

@@ -115,7 +115,7 @@ class Uncertainty(Summed):
             raise FormatError(
                 "probabilities",
                 expected=f"shape {(*target.shape, self.num_classes)}",
-                found=str(prob.shape),
+                found=prob.shape,
             )
         counted = (
             np.ones(target.shape, np.bool_) if mask is None else to_numpy(mask).astype(np.bool_)

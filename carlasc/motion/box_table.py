@@ -240,6 +240,6 @@ def check_box_file(argument: str, path: Path) -> None:
     """
     if path.suffix.lower() not in BOX_ENDINGS:
         expected = f"a file that ends in {', '.join(BOX_ENDINGS)}"
-        raise ArgumentError(argument, expected=expected, found=str(path))
+        raise ArgumentError(argument, expected=expected, found=path)
     if path.suffix.lower() == ".parquet":
         import_extra("pyarrow.parquet", "parquet")

@@ -97,13 +97,11 @@ class EvidenceScan:
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3:
-            raise FormatError("points", expected="shape (N, 3)", found=str(self.points.shape))
+            raise FormatError("points", expected="shape (N, 3)", found=self.points.shape)
         for name in ("ground", "labels", "explained"):
             values = getattr(self, name)
             if values is not None and values.shape != (len(self.points),):
-                raise FormatError(
-                    name, expected=f"shape ({len(self.points)},)", found=str(values.shape)
-                )
+                raise FormatError(name, expected=f"shape ({len(self.points)},)", found=values.shape)
 
 
 @dataclass(frozen=True)

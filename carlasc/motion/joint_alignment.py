@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from carlasc.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from carlasc.core.arrays import BoolArray, Float32Array, FloatArray, IntArray, run_starts
 from carlasc.core.compiling import cached, jit
 from carlasc.motion.solving import principal_axes, solve_positive
 
@@ -145,7 +145,7 @@ def blocks(
         keys = np.concatenate([keys for keys, _ in block])
         # A stable sort keeps the scans of a cell in order, so sums are rounded the same everywhere.
         order = np.argsort(keys, kind="stable")
-        begins = np.flatnonzero(np.diff(keys[order], prepend=-1))
+        begins = run_starts(keys[order])
         scan = np.repeat(np.arange(first, first + len(block)), [len(keys) for keys, _ in block])
         sums = np.concatenate([sums for _, sums in block])
         grouped.append(Clusters(np.append(begins, len(keys)), scan[order], sums[order]))

@@ -32,6 +32,7 @@ from carlasc.core.scans import finite, lengths
 from carlasc.errors import ArgumentError, import_extra
 from carlasc.motion.ground import ground_height, ground_points
 from carlasc.motion.joint_alignment import AlignmentPass, align
+from carlasc.running.spreading import Progress
 
 MIN_POINTS = 100  # scans with fewer points do not determine the motion
 _NEAR_M = 8.0  # farther ground is left out
@@ -81,7 +82,7 @@ def estimate_poses(
     min_range_m: float = 0.0,
     voxel_m: float | None = None,
     total: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> FloatArray:
     """Estimate the pose of every scan of a drive from its usable points, with the method of
     `follow_scans`.
@@ -387,7 +388,7 @@ def _usable(
             raise ArgumentError(
                 "seconds",
                 expected=f"{len(points)} of scan {number}, one per point",
-                found=str(len(own)),
+                found=len(own),
             )
         used = usable_points(points)
         yield points[used, :3], None if own is None else np.asarray(own)[used]

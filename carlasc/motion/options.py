@@ -47,7 +47,7 @@ class PoseOptions:
             raise ArgumentError(
                 "odometry_voxel_m",
                 expected="a positive number of metres",
-                found=str(self.odometry_voxel_m),
+                found=self.odometry_voxel_m,
             )
 
 
@@ -73,5 +73,5 @@ class MotionOptions:
         check_choice("motion", self.source, MotionSource)
         if not self.min_speed_m_s > 0:
             raise ArgumentError(
-                "min_speed_m_s", expected="a positive number", found=str(self.min_speed_m_s)
+                "min_speed_m_s", expected="a positive number", found=self.min_speed_m_s
             )

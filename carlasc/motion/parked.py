@@ -20,6 +20,7 @@ from carlasc.core.arrays import (
     FloatArray,
     Int32Array,
     IntArray,
+    run_starts,
 )
 from carlasc.core.cells import as_pose, distinct, joined, numbered
 from carlasc.core.geometry import (
@@ -139,7 +140,7 @@ def summed(found: Iterable[Compared]) -> Compared:
     """Return the cells of several scans, each once and in order, with the sums of their counts."""
     keys, counts = map(np.concatenate, zip(*found, strict=True))
     order = np.argsort(keys, kind="stable")
-    begins = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    begins = run_starts(keys[order])
     sums = np.add.reduceat(counts[order], begins, axis=0) if len(begins) else counts
     return keys[order][begins], sums
 

@@ -319,8 +319,7 @@ class _ClassImage(NamedTuple):
                 at = np.clip(rows + down, 0, height - 1), np.clip(columns + right, 0, width - 1)
                 votes[each, self.ids[at]] += weight if self.sure is None else weight * self.sure[at]
         votes[:, 0] = 0  # pixels without a class
-        total = np.maximum(votes.sum(axis=1, keepdims=True), np.float32(1e-6))
-        return votes, (votes.max(axis=1, keepdims=True) / total) ** _EDGE
+        return votes, (votes.max(axis=1, keepdims=True) / _totals(votes)) ** _EDGE
 
 
 # of this process, by the key of the feed and the frame; the last used at the end
@@ -350,7 +349,7 @@ class _ShownSequence(PredictedSequence):
         """Return the classes of the points of a scan, and their field `probabilities`."""
         points = self.feed.sequence.scan(frame, ()).points
         shares = self._weigh(frame, points.astype(np.float64))
-        shares /= np.maximum(shares.sum(axis=1, keepdims=True), np.float32(1e-6))
+        shares /= _totals(shares)
         _fill_from_neighbours(shares, points)
         shown = shares.any(axis=1)
         pairs = np.zeros((len(shares), 6), np.uint16)
@@ -438,6 +437,11 @@ class _ShownSequence(PredictedSequence):
             yield _ClassImage(camera, pose @ place, late, ids, sure, nearest, cell)
 
 
+def _totals(votes: Float32Array) -> Float32Array:
+    """Return the (N, 1) sums of (N, C) votes, never 0, to divide by."""
+    return np.maximum(votes.sum(axis=1, keepdims=True), np.float32(1e-6))
+
+
 def _cells(pixels: FloatArray, cell_px: float) -> IntArray:
     """Return (2, N) the column and the row of the cell of each pixel."""
     return ((pixels + 0.5) // cell_px).astype(np.int64).T
@@ -456,5 +460,5 @@ def _fill_from_neighbours(shares: Float32Array, points: AnyFloatArray) -> None:
         shown = shares.any(axis=1)
         likely = np.zeros((place.max(initial=-1) + 1, shares.shape[1]), np.float32)
         np.add.at(likely, place[shown], shares[shown])
-        likely *= _NEAR / np.maximum(likely.sum(axis=1, keepdims=True), np.float32(1e-6))
+        likely *= _NEAR / _totals(likely)
         shares[~shown] = likely[place[~shown]]

@@ -250,9 +250,7 @@ class PredictionReader:
         labels, scores = load(path)
         for rows in (labels, scores):
             if rows is not None and len(rows) != count:
-                raise FormatError(
-                    path, expected=f"{count} rows, one per point", found=str(len(rows))
-                )
+                raise FormatError(path, expected=f"{count} rows, one per point", found=len(rows))
         if scores is not None:
             scores = self.probabilities(scores, str(path))
             labels = scores.argmax(axis=1) if labels is None else labels
@@ -274,7 +272,7 @@ class PredictionReader:
                 f"ids of the class table {self.classes.name}, up to {max(self.classes.names)}"
             )
             advice = "give the class table of the predictions as `classes`"
-            raise FormatError(where, expected=expected, found=str(unknown[0]), advice=advice)
+            raise FormatError(where, expected=expected, found=unknown[0], advice=advice)
 
     def probabilities(self, scores: AnyFloatArray, where: str) -> Float32Array:
         """Return (N, C) scores as float32 probabilities.
@@ -349,7 +347,7 @@ def load(path: Path) -> tuple[AnyArray | None, AnyArray | None]:
         data = path.read_bytes()
     if len(data) % 4:
         raise FormatError(
-            path, expected="a multiple of 4 bytes (uint32 per point)", found=str(len(data))
+            path, expected="a multiple of 4 bytes (uint32 per point)", found=len(data)
         )
     return np.frombuffer(data, "<u4") & np.uint32(0xFFFF), None
 

@@ -38,7 +38,6 @@ from carlasc.storage.derived_copies import (
 )
 from carlasc.storage.files import AnyPath
 from carlasc.storage.inputs import digest_of_bytes
-from carlasc.storage.layout import Metadata
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 from carlasc.storage.shares import Share
 
@@ -122,7 +121,9 @@ def refine(
         out,
         {"poses": vars(poses), "texts": digest_of_bytes(b"\0".join(texts)).hex()},
         kind="refined poses",
-        is_kind=_is_refined,
+        is_kind=lambda metadata: (
+            str(metadata.extra.get("poses")).rpartition(", ")[2] in (_REFINED, _LEFT)
+        ),
         overwrite=overwrite,
         run=run,
     )
@@ -254,7 +255,3 @@ def _notes(change: RefinedPoses, frames: IntArray) -> list[str]:
     if before is not None:
         what = f"neighbouring scans disagree by {100 * before:.1f} cm"
     return [f"poses left as they are: {what}"]
-
-
-def _is_refined(metadata: Metadata) -> bool:
-    return str(metadata.extra.get("poses")).rpartition(", ")[2] in (_REFINED, _LEFT)

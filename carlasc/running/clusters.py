@@ -87,7 +87,7 @@ def _starter(where: str, workers: int | None) -> Callable[[], Any] | None:
     if match := re.fullmatch(r"local(?::([1-9][0-9]*))?", where):
         if match[1] and workers not in (None, int(match[1])):
             raise ArgumentError(
-                "workers", expected=f"no number of workers with {where}", found=str(workers)
+                "workers", expected=f"no number of workers with {where}", found=workers
             )
         return partial(_start_local, int(match[1]) if match[1] else Run(workers).processes)
     module, _, name = (

@@ -59,6 +59,9 @@ or the result of `open_cluster`.
 
 Item = TypeVar("Item")
 
+Progress = Callable[[int, int], None]
+"""Takes the numbers of steps that are done, and of all."""
+
 
 @dataclass(frozen=True)
 class Part:
@@ -79,9 +82,7 @@ class Part:
 
     def __post_init__(self) -> None:
         if not 1 <= self.number <= self.count:
-            raise ArgumentError(
-                "part", expected="I/N with I from 1 to N, such as 2/4", found=str(self)
-            )
+            raise ArgumentError("part", expected="I/N with I from 1 to N, such as 2/4", found=self)
 
     @classmethod
     def parse(cls, text: str) -> Self:
@@ -173,12 +174,12 @@ class Run:
     executor: Engine | None = None
     part: Part = Part()
     sequences_from: str | os.PathLike[str] | None = None
-    progress: Callable[[int, int], None] | None = None
+    progress: Progress | None = None
 
     def __post_init__(self) -> None:
         check_types(Run, vars(self))
         if self.workers is not None and self.workers < 1:
-            raise ArgumentError("workers", expected="at least 1", found=str(self.workers))
+            raise ArgumentError("workers", expected="at least 1", found=self.workers)
 
     @property
     def processes(self) -> int:
@@ -202,9 +203,7 @@ class StepCounter:
     A stage adds its steps as soon as their number is known.
     """
 
-    def __init__(
-        self, progress: Callable[[int, int], None] | None, total: int = 0, done: int = 0
-    ) -> None:
+    def __init__(self, progress: Progress | None, total: int = 0, done: int = 0) -> None:
         self._progress, self._done, self._total = progress, done, total
 
     def expect(self, more: int) -> None:
@@ -217,7 +216,7 @@ class StepCounter:
         if self._progress is not None:
             self._progress(self._done, self._total)
 
-    def stage(self, expected: int = 0) -> Callable[[int, int], None]:
+    def stage(self, expected: int = 0) -> Progress:
         """Return the progress callback of a stage that counts its own steps.
 
         `expected` of them are already in the total.

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from collections.abc import Sequence as Series
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -29,7 +29,6 @@ from carlasc.storage.protocol import Sequence, SequenceWriter, Sink, Source
 from carlasc.storage.shares import Share
 from carlasc.storage.transport.trees import is_url
 
-Progress = Callable[[int, int], None]
 _FEW = 4  # minimum number of tasks per process, because starting a process takes time
 _SAMPLED = 5  # number of frames that are read to estimate the size of frames
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -205,29 +204,32 @@ class DerivedCopy:
         run.part.refuse(overwrite)
         refuse_overlap(out, source)
         self.source, self.out, self.overwrite = source, out, overwrite
-        self.part = run.part
+        self.part, self.folder = run.part, Path(out)
+        self.partial, self.older = unfinished(self.folder), replaced(self.folder)
+        # beside an unfinished copy; records its input and options
         self.mark: Path | None = None
         inputs = sequence_states(source)
-        settings = {"source": source.location, "kind": kind, "inputs": inputs, **made_from}
-        self.made_from = combined(to_json(settings))
+        about = {"source": source.location, "kind": kind, "inputs": inputs, **made_from}
+        settings = to_json(about)
+        self.made_from = combined(settings)
         if not (is_url(out) or run.part.count > 1):
-            self.mark = _mark_of(unfinished(Path(out)))
-            if not overwrite and Path(out).exists():
-                if self._was_finished(to_json(settings)):
+            self.mark = self.partial.with_name(f"{self.partial.name}.json")
+            if not overwrite and self.folder.exists():
+                if self._was_finished(settings):
                     self._finish(FolderSource(out).sequences())
-                if has_content(record := Path(out) / _RECORD):
-                    check_complete(out, record.read_bytes() == to_json(settings))
-            _check_replaceable(Path(out), kind, is_kind, overwrite=overwrite)
-            _begin(self.mark, unfinished(Path(out)), to_json(settings), overwrite=overwrite)
-            if Path(out).exists():  # an older copy, which is removed when the new one is complete
-                remove(replaced(Path(out)))
-                Path(out).rename(replaced(Path(out)))
+                if has_content(record := self.folder / _RECORD):
+                    check_complete(out, record.read_bytes() == settings)
+            _check_replaceable(self.folder, kind, is_kind, overwrite=overwrite)
+            _begin(self.mark, self.partial, settings, overwrite=overwrite)
+            if self.folder.exists():  # an older copy, removed when the new one is complete
+                remove(self.older)
+                self.folder.rename(self.older)
 
     def writer(self, path: str) -> SequenceWriter | None:
         """Return the writer for data derived from a sequence, kept until the copy is complete; None
         if they cannot be kept.
         """
-        return None if self.mark is None else FolderSink(unfinished(Path(self.out))).sequence(path)
+        return None if self.mark is None else FolderSink(self.partial).sequence(path)
 
     def write(self, sequences: Mapping[str, DerivedSequence], run: Run) -> CopyResult:
         """Write the sequences of the copy.
@@ -239,13 +241,13 @@ class DerivedCopy:
         Raises:
             StorageError: the files cannot be written.
         """
-        began, linked = time.perf_counter(), 0
+        linked = 0
         if not is_url(self.out):
-            folder = Path(self.out) if self.mark is None else unfinished(Path(self.out))
+            folder = self.folder if self.mark is None else self.partial
             linked = sum(_link_files(one, folder / path) for path, one in sequences.items())
-        with _naming_replaced(Path(self.out)):
+        with self._naming_older():
             if self.mark is None:
-                copied = UnpackResult(str(self.out) if is_url(self.out) else Path(self.out))
+                copied = UnpackResult(str(self.out) if is_url(self.out) else self.folder)
                 write_files(
                     sequences,
                     FolderSink(self.out),
@@ -259,8 +261,7 @@ class DerivedCopy:
                 copied = unpack(ChosenSequences(self.source.location, sequences), self.out, run=run)
         self._finish(sequences)
         return CopyResult(
-            **vars(copied)
-            | {"kept": copied.kept - linked, "elapsed_s": time.perf_counter() - began},
+            **vars(copied) | {"kept": copied.kept - linked},
             linked=linked,
             left_out=sorted({name for one in sequences.values() for name in one.left_out}),
         )
@@ -268,7 +269,7 @@ class DerivedCopy:
     def _was_finished(self, settings: bytes) -> bool:
         """Whether a killed run had these settings, and all files of the copy have their place."""
         mark = self.mark
-        if mark is None or unfinished(Path(self.out)).exists() or not has_content(mark):
+        if mark is None or self.partial.exists() or not has_content(mark):
             return False
         return mark.read_bytes() == settings
 
@@ -277,23 +278,22 @@ class DerivedCopy:
         if self.mark is None:
             return
         for path in paths:
-            shutil.rmtree(Path(self.out) / path / layout.DERIVED, ignore_errors=True)
-        write_atomic(Path(self.out) / _RECORD, self.mark.read_bytes())
+            shutil.rmtree(self.folder / path / layout.DERIVED, ignore_errors=True)
+        write_atomic(self.folder / _RECORD, self.mark.read_bytes())
         self.mark.unlink(missing_ok=True)
         if self.overwrite:
-            remove(replaced(Path(self.out)))
+            remove(self.older)
 
-
-@contextmanager
-def _naming_replaced(out: Path) -> Iterator[None]:
-    """Say in errors where the older copy is that was moved aside."""
-    try:
-        yield
-    except CarlascError as error:
-        if replaced(out).exists() and not out.exists():
-            where = f"the data set that was in {out.name} is in {replaced(out)}"
-            error.advice = "; ".join(part for part in (error.advice, where) if part)
-        raise
+    @contextmanager
+    def _naming_older(self) -> Iterator[None]:
+        """Say in errors where the older copy is that was moved aside."""
+        try:
+            yield
+        except CarlascError as error:
+            if self.older.exists() and not self.folder.exists():
+                where = f"the data set that was in {self.folder.name} is in {self.older}"
+                error.advice = "; ".join(part for part in (error.advice, where) if part)
+            raise
 
 
 def check_complete(out: AnyPath, is_complete: bool) -> None:
@@ -325,11 +325,6 @@ def _check_replaceable(
     ):
         expected, advice = f"a data set with {kind} to overwrite", "choose another name"
         raise ConflictError(out, expected=expected, found="something else", advice=advice)
-
-
-def _mark_of(folder: Path) -> Path:
-    """Return the file beside an unfinished copy that records its input and options."""
-    return folder.with_name(f"{folder.name}.json")
 
 
 def _begin(mark: Path, folder: Path, data: bytes, *, overwrite: bool) -> None:

@@ -6,12 +6,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from carlasc.errors import ArgumentError, ConflictError, FormatError, check_choice, check_types
-from carlasc.running.spreading import StepCounter
+from carlasc.running.spreading import Progress, StepCounter
 from carlasc.storage.extraction import check_space, extract_zip, extracted_size
 from carlasc.storage.files import (
     AnyPath,
@@ -23,9 +23,6 @@ from carlasc.storage.files import (
     writing,
 )
 from carlasc.storage.transport.fetching import FileFetch
-
-Progress = Callable[[int, int], None]
-
 
 _S3 = "https://curly-dataset-public.s3.us-east-2.amazonaws.com/CARLA"
 SEQUENCES = "sequences"
@@ -186,7 +183,7 @@ def download(
     check_types(download, locals())
     began = time.perf_counter()
     if connections < 1:
-        raise ArgumentError("connections", expected="1 or more", found=str(connections))
+        raise ArgumentError("connections", expected="1 or more", found=connections)
     if keep and not extract:
         raise ArgumentError(
             "keep",

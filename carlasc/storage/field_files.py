@@ -11,6 +11,7 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray, Float32Array
 from carlasc.core.boxes import BOXES_DTYPE
+from carlasc.core.classes import ClassTable
 from carlasc.errors import FormatError
 from carlasc.storage.arrays import ArrayFormat, npz_bytes, open_npz
 from carlasc.storage.files import damaged
@@ -18,6 +19,13 @@ from carlasc.storage.files import damaged
 VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "u1"), ("votes", "<u2")])
 WIDE_VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "<u2"), ("votes", "<u2")])
 VELOCITY_DTYPE = np.dtype([("voxel", "<i4"), ("velocity", "<f2", (3,))])
+
+
+def votes_dtype(classes: ClassTable) -> np.dtype[np.void]:
+    """Return the type of a row of votes for the classes of a table."""
+    return VOTES_DTYPE if classes.dtype == np.uint8 else WIDE_VOTES_DTYPE
+
+
 TABLES = {
     "votes": (VOTES_DTYPE, WIDE_VOTES_DTYPE),
     "velocities": (VELOCITY_DTYPE,),
@@ -173,11 +181,9 @@ class Field:
             raise FormatError(where, expected=f"shape (N, {self.columns})", found=f"{array.shape}")
         dtype = np.dtype(self.dtype)
         if dtype.kind == "u" and array.dtype.kind not in "ub":
-            raise FormatError(where, expected="unsigned integers", found=str(array.dtype))
+            raise FormatError(where, expected="unsigned integers", found=array.dtype)
         if dtype.kind == "u" and array.dtype.itemsize > dtype.itemsize:
-            raise FormatError(
-                where, expected=f"{dtype.name} or a smaller type", found=str(array.dtype)
-            )
+            raise FormatError(where, expected=f"{dtype.name} or a smaller type", found=array.dtype)
 
 
 def _decode_npz(
@@ -218,7 +224,7 @@ def check_velocity(velocity: AnyArray, count: int, where: str) -> None:
     """
     voxel = velocity["voxel"]
     if len(outside := voxel[(voxel < 0) | (voxel >= count)]):
-        raise FormatError(where, expected=f"voxels 0 to {count - 1}", found=str(outside[0]))
+        raise FormatError(where, expected=f"voxels 0 to {count - 1}", found=outside[0])
     if not np.isfinite(velocity["velocity"]).all():
         raise FormatError(where, expected="finite velocities", found="NaN or infinity")
 

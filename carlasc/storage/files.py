@@ -230,7 +230,7 @@ def check_target(out: Path, endings: tuple[str, ...], overwrite: bool) -> None:
     """
     if out.suffix.lower() not in endings:
         raise ArgumentError(
-            "out", expected=f"a file name that ends in {' or '.join(endings)}", found=str(out)
+            "out", expected=f"a file name that ends in {' or '.join(endings)}", found=out
         )
     if out.is_dir():
         raise ArgumentError("out", expected="a file name", found=f"the folder {out}")

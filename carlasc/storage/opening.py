@@ -161,7 +161,7 @@ def as_sink(
     suffix = PurePosixPath(out.location if isinstance(out, Target) else out).suffix
     if part.count > 1 and suffix in PACKED[1:]:
         raise ArgumentError(
-            "part", expected="a folder or a .zarr store as output of several parts", found=str(out)
+            "part", expected="a folder or a .zarr store as output of several parts", found=out
         )
     if suffix in PACKED:
         return open_sink(out, None, overwrite, **storage_options)

@@ -15,11 +15,10 @@ import numpy as np
 
 from carlasc.core.arrays import AnyArray
 from carlasc.errors import ArgumentError, ConflictError, check_types
-from carlasc.running.spreading import Run, StepCounter
+from carlasc.running.spreading import Progress, Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.copying import (
     FrameBlock,
-    Progress,
     blocks_of,
     copy_blocks,
     copy_documents,
@@ -127,7 +126,7 @@ def pack(
         raise ArgumentError(
             "part" if run.executor is None else "executor",
             expected="a .zarr store, which several processes can write",
-            found=str(out),
+            found=out,
         )
     source = as_source(source)
     refuse_overlap(out, source)

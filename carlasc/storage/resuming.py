@@ -194,27 +194,32 @@ def agree_lines(
     return None if np.array_equal(merged, existing, equal_nan=True) else encode(merged)
 
 
+def read_metadata(writer: SequenceWriter) -> Metadata | None:
+    """Return the metadata that exist in the output; None if there are none."""
+    data = writer.read_document(layout.METADATA)
+    where = f"{writer.location}/{layout.METADATA}"
+    return None if data is None else Metadata.from_json(data, where)
+
+
 def agree_metadata(writer: SequenceWriter, metadata: Metadata) -> bytes | None:
     """Return the carlasc.json to write; None if it exists or would hold only the defaults.
 
     Raises:
         ConflictError: the existing file has other axes or other classes.
     """
-    data = writer.read_document(layout.METADATA)
-    where = f"{writer.location}/{layout.METADATA}"
-    there = Metadata() if data is None else Metadata.from_json(data, where)
-    if data is not None and (there.axes, there.classes) != (metadata.axes, metadata.classes):
+    there = read_metadata(writer)
+    if there is not None and (there.axes, there.classes) != (metadata.axes, metadata.classes):
         other = (
             " with other ids, names or roles" if there.classes.name == metadata.classes.name else ""
         )
         other = "" if there.classes == metadata.classes else other
         raise ConflictError(
-            where,
+            f"{writer.location}/{layout.METADATA}",
             expected=f"the axes {metadata.axes} and the classes {metadata.classes.name}",
             found=f"{there.axes} and {there.classes.name}{other}",
             advice="choose another `out`",
         )
-    return metadata.to_json() if data is None and metadata != Metadata() else None
+    return metadata.to_json() if there is None and metadata != Metadata() else None
 
 
 def check_scan(writer: SequenceWriter, field: str, frame: int, array: AnyArray) -> bool:

@@ -73,7 +73,7 @@ def sample_of(
         ArgumentError: `sample` is less than 1.
     """
     if sample is not None and sample < 1:
-        raise ArgumentError(name, expected="1 or more", found=str(sample))
+        raise ArgumentError(name, expected="1 or more", found=sample)
     if sample is None and sequences_from is None:
         return [""], {}
     places = read_list(Run(sequences_from=sequences_from), source.places)

@@ -318,7 +318,7 @@ class LabelFrames(VoxelFrames):
                 raise FormatError(
                     invalid,
                     expected=f"{self.voxels} bytes, or {packed} of packed bits",
-                    found=str(mask.size),
+                    found=mask.size,
                     advice="the file may be truncated, or of another grid",
                 )
             mask = np.unpackbits(mask, count=self.voxels)

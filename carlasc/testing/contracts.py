@@ -10,7 +10,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
@@ -223,9 +222,7 @@ class SinkContract:
     def given(cls, tmp_path_factory: pytest.TempPathFactory) -> Source:
         return FolderSource(write_dataset(tmp_path_factory.mktemp("published") / "data", seed=1))
 
-    def write_all(
-        self, given: Source, sink: Sink, order: Callable[[list[str]], list[str]] = sorted
-    ) -> None:
+    def write_all(self, given: Source, sink: Sink) -> None:
         with sink:
             for path, sequence in given.sequences().items():
                 with sink.sequence(path) as writer:
@@ -236,7 +233,7 @@ class SinkContract:
                     )
                     # all fields of a frame before the next frame, as in a run over frames
                     for frame in frames:
-                        for name in order(
+                        for name in sorted(
                             [n for n in sequence.fields() if frame in sequence.frames(n)]
                         ):
                             writer.write(name, frame, sequence.read(name, frame))

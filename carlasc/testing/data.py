@@ -237,15 +237,15 @@ def wrong_labels(
             classes.
     """
     if not 0 <= share <= 1:
-        raise ArgumentError("share", expected="a number from 0 to 1", found=str(share))
+        raise ArgumentError("share", expected="a number from 0 to 1", found=share)
     if clump_m is not None and not clump_m > 0:
-        raise ArgumentError("clump_m", expected="a length above 0", found=str(clump_m))
+        raise ArgumentError("clump_m", expected="a length above 0", found=clump_m)
     result, places = labels.copy(), np.flatnonzero(labels)
     others = np.unique(labels[places] if classes is None else list(classes)).astype(labels.dtype)
     if not len(places) or not share:
         return result
     if len(others) < 2:
-        raise ArgumentError("classes", expected="two classes or more", found=str(others.tolist()))
+        raise ArgumentError("classes", expected="two classes or more", found=others.tolist())
     if clump_m is None:
         rng = np.random.default_rng(seed)
         wrong = rng.permutation(places)[: round(share * len(places))]
@@ -308,7 +308,7 @@ def wrong_poses(
     }
     for name, value in deviations.items():
         if not 0 <= value < np.inf:
-            raise ArgumentError(name, expected="a standard deviation, 0 or more", found=str(value))
+            raise ArgumentError(name, expected="a standard deviation, 0 or more", found=value)
     rng = np.random.default_rng(seed)
     wrong = np.array(poses, np.float64)
     motions = multiply(invert(wrong[:-1]), wrong[1:])

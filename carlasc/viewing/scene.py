@@ -92,7 +92,7 @@ class Scene:
         check_types(Scene, vars(self))
         FrameRange.of(self.frames)
         if self.every < 1:
-            raise ArgumentError("every", expected="1 or more", found=str(self.every))
+            raise ArgumentError("every", expected="1 or more", found=self.every)
         check_choice("palette", self.palette, PALETTES)
         for name, table in (("classes", self.classes), ("source_classes", self.source_classes)):
             table_of(table, name)

@@ -20,6 +20,7 @@ from typing import BinaryIO, overload
 
 from carlasc.core.classes import TableUse
 from carlasc.errors import ArgumentError, ConflictError, check_types
+from carlasc.running.spreading import Progress, StepCounter
 from carlasc.storage.files import (
     AnyPath,
     check_target,
@@ -47,7 +48,6 @@ PAGES = (".html", ".htm")
 MAX_FRAMES = 60
 """Frames of a page in one file and of a recording, if the scene gives no range: a few megabytes."""
 
-Progress = Callable[[int, int], None] | None
 
 _SCRIPTS = (
     *("interface.js", "decode.js", "store.js", "modes.js", "voxels.js", "points.js", "path.js"),
@@ -92,7 +92,7 @@ def view(
     beside_grid: str | None = ...,
     full_points: bool = ...,
     overwrite: bool = ...,
-    progress: Callable[[int, int], None] | None = ...,
+    progress: Progress | None = ...,
     report: Callable[[str], None] | None = ...,
 ) -> ViewResult: ...
 
@@ -115,7 +115,7 @@ def view(
     beside_grid: str | None = None,
     full_points: bool = False,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
     report: Callable[[str], None] | None = None,
 ) -> ViewResult | None:
     """Write a scene as a page for any browser or as a recording, or, without `out`, show it in a
@@ -162,14 +162,14 @@ def view(
     if ending not in ("", *PAGES, *RECORDINGS):
         endings = ", ".join((PAGES[0], *RECORDINGS))
         expected = f"a name that ends in {endings}, or without an ending for a folder"
-        raise ArgumentError("out", expected=expected, found=str(out))
+        raise ArgumentError("out", expected=expected, found=out)
     compared, page = beside is not None or beside_grid is not None, target and not recorded
     for name, given, fits, expected in (
         ("beside", compared, page, "a page, .html or a folder"),
         ("full_points", full_points, recorded, "a recording, .rrd or .mcap"),
     ):
         if given and not fits:
-            raise ArgumentError(name, expected=expected, found=str(out or "a window"))
+            raise ArgumentError(name, expected=expected, found=out or "a window")
     if target is None:
         show_window(scene.open(), report)
         return None
@@ -178,7 +178,7 @@ def view(
     else:
         check_folder(target, overwrite)
     if not recorded and not 0.01 <= thin_m <= 10:
-        raise ArgumentError("thin_m", expected="0.01 to 10 metres", found=str(thin_m))
+        raise ArgumentError("thin_m", expected="0.01 to 10 metres", found=thin_m)
     content = open_content(scene, thin_m, beside, beside_grid)
     frames, notes = content.frames, content.reader.notes
     if ending and scene.frames is None and len(frames) > MAX_FRAMES:
@@ -209,14 +209,18 @@ def view(
 
 
 def _write_recording(
-    reader: SceneReader, ending: str, max_points: int | None, progress: Progress, file: BinaryIO
+    reader: SceneReader,
+    ending: str,
+    max_points: int | None,
+    progress: Progress | None,
+    file: BinaryIO,
 ) -> None:
     writer = _WRITERS[ending](Path(file.name), reader)
+    step = StepCounter(progress, len(reader.frames))
     try:
-        for done, frame in enumerate(record_frames(reader, max_points), 1):
+        for frame in record_frames(reader, max_points):
             writer.write(frame)
-            if progress is not None:
-                progress(done, len(reader.frames))
+            step()
     except BaseException:
         with suppress(OSError):  # the first error is reported
             writer.close()
@@ -247,13 +251,13 @@ def estimate_size(reader: SceneReader, ending: str, max_points: int | None) -> i
     return sizes[0] + (sizes[1] - sizes[0]) * (len(frames) - 1) // (len(sample) - 1)
 
 
-def _write_file(content: PageContent, progress: Progress, file: BinaryIO) -> None:
+def _write_file(content: PageContent, progress: Progress | None, file: BinaryIO) -> None:
     """Write one file that contains the frames."""
     scores: list[Scores] = []
     file.writelines(_compose(content, scores, _blocks(content, scores, progress)))
 
 
-def _write_folder(content: PageContent, progress: Progress, out: Path) -> None:
+def _write_folder(content: PageContent, progress: Progress | None, out: Path) -> None:
     """Write index.html and a file for each frame."""
     scores: list[Scores] = []
     with writing_folder(out) as folder:
@@ -265,15 +269,16 @@ def _write_folder(content: PageContent, progress: Progress, out: Path) -> None:
             path.write_bytes(b"".join(_compose(content, scores, None)))
 
 
-def _blocks(content: PageContent, scores: list[Scores], progress: Progress) -> Iterator[bytes]:
+def _blocks(
+    content: PageContent, scores: list[Scores], progress: Progress | None
+) -> Iterator[bytes]:
     """Yield each frame as one block of arrays (see `page.contents`), and append its scores."""
-    trails = Trails()
-    for done, frame in enumerate(content.frames, 1):
+    trails, step = Trails(), StepCounter(progress, len(content.frames))
+    for frame in content.frames:
         arrays, own = content.read(frame, trails)
         scores.append(own)
         yield pack_arrays(arrays)
-        if progress is not None:
-            progress(done, len(content.frames))
+        step()
 
 
 def _compose(

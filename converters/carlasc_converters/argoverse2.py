@@ -348,7 +348,7 @@ class Sweep(FrameHandle):
             raise FormatError(
                 self.location,
                 expected=f"laser numbers 0..{2 * _LASERS - 1}",
-                found=str(lasers.max()),
+                found=lasers.max(),
             )
         points = np.empty((count, 4), np.float32)
         for column, name in enumerate(("x", "y", "z", "intensity")):

@@ -656,7 +656,7 @@ class BagCamera:
             data = np.asarray(message.data, np.uint8)
             if place.channel.type == COMPRESSED_IMAGE:
                 if (ending := _IMAGE_ENDINGS.get(data[:2].tobytes())) is None:
-                    raise FormatError(where, expected="a JPEG or PNG", found=str(message.format))
+                    raise FormatError(where, expected="a JPEG or PNG", found=message.format)
                 return ending, data.tobytes()
             if message.encoding not in _CHANNELS:
                 raise FormatError(

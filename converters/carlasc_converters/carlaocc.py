@@ -161,7 +161,7 @@ class CarlaOccRecording(Recording):
             rows = np.loadtxt(path, ndmin=2)
         if rows.shape[1] != 17:
             raise FormatError(
-                path, expected="17 numbers per line: frame and 4 x 4 pose", found=str(rows.shape[1])
+                path, expected="17 numbers per line: frame and 4 x 4 pose", found=rows.shape[1]
             )
         if missing := sorted(
             {frame.number for frame in self.frames} - set(rows[:, 0].astype(int).tolist())

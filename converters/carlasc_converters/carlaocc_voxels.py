@@ -59,7 +59,7 @@ class CarlaOccGrids(GridFrames):
         file = self.files[frame]
         if (spec := read_geometry(file)) != self.spec:
             raise FormatError(
-                file, expected=f"the geometry of the first frame: {self.spec}", found=str(spec)
+                file, expected=f"the geometry of the first frame: {self.spec}", found=spec
             )
         return read_voxels(file, spec)
 
@@ -154,7 +154,7 @@ def read_geometry(path: str | Path) -> GridSpec:
         raise FormatError(
             path,
             expected="voxel_size, and 3 values of voxel_origin and volume_size",
-            found=str(error),
+            found=error,
         ) from error
 
 

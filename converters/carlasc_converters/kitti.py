@@ -197,7 +197,7 @@ class KittiFrame(FrameHandle):
             raise FormatError(
                 self._label_file,
                 expected=f"a label for each of {len(points)} points",
-                found=str(len(labels)),
+                found=len(labels),
                 advice="the file belongs to another scan, or is incomplete",
             )
         return [Cloud(points, labels, instances)]

@@ -178,7 +178,7 @@ class Kitti360Drive(Recording):
         rectify = calibration.values.get("R_rect_00", ())
         if len(rectify) != 9:
             raise FormatError(
-                calibration.path, expected="9 numbers after R_rect_00", found=str(len(rectify))
+                calibration.path, expected="9 numbers after R_rect_00", found=len(rectify)
             )
         rectified_T_camera = np.eye(4)
         rectified_T_camera[:3, :3] = np.reshape(rectify, (3, 3))

@@ -51,12 +51,12 @@ def rectified_cameras(
         numbers = calibration.values[key]
         if len(numbers) != 12:
             raise FormatError(
-                calibration.path, expected=f"12 numbers after {key}", found=str(len(numbers))
+                calibration.path, expected=f"12 numbers after {key}", found=len(numbers)
             )
         rows = np.reshape(numbers, (3, 4))
         if rows[0, 0] <= 0 or rows[1, 1] <= 0 or (rows[2, :3] != (0, 0, 1)).any():
             expected = f"fx 0 cx, 0 fy cy, 0 0 1 and a translation after {key}"
-            raise FormatError(calibration.path, expected=expected, found=str(numbers))
+            raise FormatError(calibration.path, expected=expected, found=numbers)
         rectified_T_camera = translation(-np.linalg.solve(rows[:, :3], rows[:, 3]))
         paths = {frame: image_of(name, frame) for frame in frames}
         existing = [path for path in paths.values() if path.is_file()]

@@ -65,7 +65,7 @@ def read_array(path: str, dtype: np.dtype[Any], columns: int) -> AnyArray:
         raise FormatError(
             path,
             expected=f"a multiple of {row} bytes",
-            found=str(len(data)),
+            found=len(data),
             advice="the file is incomplete: copy it again",
         )
     return data.view(dtype).reshape(-1, columns)
@@ -177,7 +177,7 @@ class Calibration:
             raise FormatError(
                 self.path,
                 expected=f"{count} numbers {where}",
-                found=str(len(values)),
+                found=len(values),
                 advice=_AGAIN,
             )
         return values

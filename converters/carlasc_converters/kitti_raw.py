@@ -133,9 +133,7 @@ class RawDrive(Recording):
         path = self.folder / "oxts" / "data" / f"{number:010d}.txt"
         packets = read_packets(path)
         if len(packets) != 1:
-            raise FormatError(
-                path, expected="one line", found=str(len(packets)), advice="copy it again"
-            )
+            raise FormatError(path, expected="one line", found=len(packets), advice="copy it again")
         return packets[0]
 
     def _lidar_T_imu(self, force: bool) -> Transform:

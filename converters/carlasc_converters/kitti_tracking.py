@@ -186,7 +186,7 @@ class TrackingSequence(Recording):
                 raise FormatError(
                     where,
                     expected=f"{_COLUMNS} columns",
-                    found=str(len(row)),
+                    found=len(row),
                     advice="copy it again",
                 )
             if row[2] == _IGNORED:
@@ -195,11 +195,9 @@ class TrackingSequence(Recording):
                 frame, track = int(row[0]), int(row[1])
                 height, width, length, x, y, z, turn = map(float, row[10:_COLUMNS])
             except ValueError as error:
-                raise FormatError(
-                    where, expected="numbers but in column 3", found=str(error)
-                ) from error
+                raise FormatError(where, expected="numbers but in column 3", found=error) from error
             if not 0 <= track < _MAX_TRACK:
-                raise FormatError(where, expected=f"a track 0..{_MAX_TRACK - 1}", found=str(track))
+                raise FormatError(where, expected=f"a track 0..{_MAX_TRACK - 1}", found=track)
             camera_T_box = _camera_T_box(np.array([x, y - height / 2, z]), turn)
             size = np.array([length, width, height])
             rows.add(frame, track + 1, class_of(row[2], where), lidar_T_camera @ camera_T_box, size)

@@ -37,7 +37,7 @@ def unpack_bits(data: bytes, size: tuple[int, int, int], where: str) -> BoolArra
         raise FormatError(
             where,
             expected=f"{-(-voxels // 8)} bytes of packed bits",
-            found=str(len(data)),
+            found=len(data),
             advice=_COPY,
         )
     return np.unpackbits(np.frombuffer(data, np.uint8), count=voxels).reshape(size).astype(np.bool_)

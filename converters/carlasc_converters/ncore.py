@@ -58,7 +58,7 @@ class Ncore(Converter):
                 raise FormatError(
                     path,
                     expected=f"NCore {_VERSION}",
-                    found=str(about.get("version", "no version")),
+                    found=about.get("version", "no version"),
                 )
             stores[path.parent, str(about["sequence_id"])].append(store)
         recordings = [NcoreRecording(name, parts) for (_, name), parts in sorted(stores.items())]
@@ -110,7 +110,7 @@ class NcoreRecording(Recording):
                         raise FormatError(
                             f"{store.path}: {group}",
                             expected=f"version {_COMPONENT}",
-                            found=str(version),
+                            found=version,
                         )
                     components[name] = (store, group)
         return by_kind
@@ -224,7 +224,7 @@ class NcoreRecording(Recording):
                 raise MissingDataError(
                     self.location,
                     expected=f"poses from {name} to {self._vehicle}",
-                    found=str(self._tree),
+                    found=self._tree,
                 )
             sensors.append(
                 Sensor(name, self._tree.lookup(self._vehicle, name, at)[0], deskewed=False)
@@ -379,7 +379,7 @@ class NcoreRecording(Recording):
             raise MissingDataError(
                 self.location,
                 expected=f"poses from {reference} to {self._vehicle}",
-                found=str(self._tree),
+                found=self._tree,
             )
         root = self._tree.ancestors(self._vehicle)[-1]
         now, then = (
@@ -427,7 +427,7 @@ class NcoreFrame(FrameHandle):
             raise FormatError(
                 f"{path}: {group}",
                 expected=f"returns of {len(rays['direction'])} rays",
-                found=str(distance.shape),
+                found=distance.shape,
             )
         which, ray = np.nonzero(np.isfinite(distance))
         points = np.empty((len(ray), 4), np.float32)

@@ -86,7 +86,7 @@ class NcoreStore:
             data = file.read(min(size, end))
         if len(data) < size:
             raise FormatError(
-                self.path, expected=f"{size} bytes of {name}", found=str(len(data)), advice=COPY
+                self.path, expected=f"{size} bytes of {name}", found=len(data), advice=COPY
             )
         return data
 
@@ -146,12 +146,12 @@ class NcoreStore:
             config, codec = about["compressor"], None
             if config is not None:
                 if config["id"] not in _SIZES:
-                    raise FormatError(where, expected="chunks of blosc", found=str(config["id"]))
+                    raise FormatError(where, expected="chunks of blosc", found=config["id"])
                 codec = import_extra("numcodecs", "ncore").get_codec(config)
             counts = [-(-size // step) for size, step in zip(shape, chunks, strict=True)]
             if math.prod(counts) > _MOST_CHUNKS:
                 expected = f"at most {_MOST_CHUNKS} chunks"
-                raise FormatError(where, expected=expected, found=str(math.prod(counts)))
+                raise FormatError(where, expected=expected, found=math.prod(counts))
             length = math.prod(chunks) * values.itemsize
             for index in itertools.product(*map(range, counts)):
                 key = about.get("dimension_separator", ".").join(map(str, index)) or "0"

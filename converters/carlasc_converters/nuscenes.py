@@ -182,7 +182,7 @@ class NuScenesScene(Recording):
             raise FormatError(
                 self.location,
                 expected=f"one calibration of {CHANNEL} in a scene",
-                found=str(len(mounts)),
+                found=len(mounts),
             )
         return (
             Sensor(

@@ -51,7 +51,7 @@ class NuScenesFrame(FrameHandle):
             raise FormatError(
                 self.location,
                 expected=f"a multiple of {4 * _COLUMNS} bytes ({_COLUMNS} float32 a point)",
-                found=str(len(data)),
+                found=len(data),
                 advice="the file is incomplete: unpack it again",
             )
         points = np.frombuffer(data, "<f4").reshape(-1, _COLUMNS)[:, :4].copy()
@@ -114,7 +114,7 @@ def _check_labels(labels: AnyArray, points: int, path: str) -> None:
         raise FormatError(
             path,
             expected=f"a label for each of {points} points",
-            found=str(len(labels)),
+            found=len(labels),
             advice="the file belongs to another scan, or is incomplete",
         )
     NUSCENES.check(labels, path)

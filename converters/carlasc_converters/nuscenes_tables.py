@@ -214,7 +214,7 @@ class Tables:
                 matrix = np.array(intrinsic, np.float64).reshape(3, 3)
             except ValueError as error:
                 raise FormatError(
-                    path, expected="3 x 3 numbers in camera_intrinsic", found=str(intrinsic)
+                    path, expected="3 x 3 numbers in camera_intrinsic", found=intrinsic
                 ) from error
             cameras[token] = CameraRow(str(channels.get(sensor)), pose, matrix)
         return cameras

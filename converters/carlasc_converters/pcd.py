@@ -76,11 +76,11 @@ def read_pcd(path: str | Path) -> dict[str, AnyArray]:
             body = _unpacked(body, row, count, where)
         if len(body) < count * row.itemsize:
             raise FormatError(
-                where, expected=f"{count} points", found=str(len(body) // row.itemsize), advice=COPY
+                where, expected=f"{count} points", found=len(body) // row.itemsize, advice=COPY
             )
         rows = np.frombuffer(body, row, count)
     if len(rows) != count:
-        raise FormatError(where, expected=f"{count} points", found=str(len(rows)), advice=COPY)
+        raise FormatError(where, expected=f"{count} points", found=len(rows), advice=COPY)
     return {name: rows[name] for name in row.names or () if not name.startswith("_")}
 
 

@@ -97,9 +97,7 @@ class PlyVertices:
             return replace(vertices, starts=starts)
         if size < start + vertices.count * dtype.itemsize:
             found = max(0, size - start) // dtype.itemsize
-            raise FormatError(
-                path, expected=f"{vertices.count} vertices", found=str(found), advice=_CUT
-            )
+            raise FormatError(path, expected=f"{vertices.count} vertices", found=found, advice=_CUT)
         return vertices
 
     def __len__(self) -> int:
@@ -191,7 +189,7 @@ class PlyVertices:
             raise FormatError(
                 self.path,
                 expected=f"{self.count} vertices",
-                found=str(start + len(rows)),
+                found=start + len(rows),
                 advice=_CUT,
             )
         return rows
@@ -272,7 +270,7 @@ def _starts(path: str, start: int, element: tuple[int, _Properties], order: str)
             start += first
         if start > len(data):
             raise FormatError(
-                path, expected=f"{count} rows with lists", found=str(len(starts) - 1), advice=_CUT
+                path, expected=f"{count} rows with lists", found=len(starts) - 1, advice=_CUT
             )
         starts.append(start)
     return np.array(starts, np.int64)

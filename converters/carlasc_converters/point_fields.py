@@ -328,7 +328,7 @@ def whole_numbers(values: AnyArray, where: str) -> Uint32Array:
         whole = values.astype(np.uint32)
     if not np.array_equal(whole, values):
         worst = values[np.flatnonzero(whole != values)[0]]
-        raise FormatError(where, expected="whole numbers from 0 to 4294967295", found=str(worst))
+        raise FormatError(where, expected="whole numbers from 0 to 4294967295", found=worst)
     return whole
 
 

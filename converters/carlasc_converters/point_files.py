@@ -70,7 +70,7 @@ def _read_bin(path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray
             path,
             expected=f"a multiple of {_FLOAT * len(columns)} bytes ({len(columns)} float32 per "
             f"point)",
-            found=str(len(data)),
+            found=len(data),
             advice=f"check `columns` ({','.join(columns)})",
         )
     width, sample = len(columns), values[:_VALUES]
@@ -140,7 +140,7 @@ def _named(array: AnyArray, path: Path, columns: tuple[str, ...] | None) -> dict
         raise FormatError(
             path,
             expected=f"{len(names)} columns ({','.join(names)})",
-            found=str(array.shape[1]),
+            found=array.shape[1],
             advice="name all columns with `columns`",
         )
     return dict(zip(names, array.T, strict=True))

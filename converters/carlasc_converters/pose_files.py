@@ -273,9 +273,7 @@ def _each(
         try:
             values.append(parse(row))
         except ValueError as error:
-            raise FormatError(
-                f"{path}: row {number}", expected=expected, found=str(error)
-            ) from None
+            raise FormatError(f"{path}: row {number}", expected=expected, found=error) from None
     return values
 
 

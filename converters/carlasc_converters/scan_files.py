@@ -138,7 +138,5 @@ def read_labels(path: Path, count: int) -> Uint32Array:
             values = np.loadtxt(path, ndmin=1)
     labels = whole_numbers(np.asarray(values).reshape(-1), str(path))
     if len(labels) != count:
-        raise FormatError(
-            path, expected=f"a label for each of {count} points", found=str(len(labels))
-        )
+        raise FormatError(path, expected=f"a label for each of {count} points", found=len(labels))
     return labels

@@ -345,7 +345,7 @@ def _numbers(path: Path, batch: Any, name: str) -> FloatArray:
     column = batch.column(name).to_numpy(zero_copy_only=False)
     if column.dtype.kind not in "iuf":
         raise FormatError(
-            path, expected=f"numbers in the column {name}", found=str(batch.schema.field(name).type)
+            path, expected=f"numbers in the column {name}", found=batch.schema.field(name).type
         )
     return column.astype(np.float64)
 

@@ -59,7 +59,7 @@ def _items(path: Path) -> list[ElementTree.Element]:
     """Return the elements of the tracklets."""
     size = path.stat().st_size
     if size > MAX_BYTES:
-        raise FormatError(path, expected=f"at most {MAX_BYTES} bytes", found=str(size))
+        raise FormatError(path, expected=f"at most {MAX_BYTES} bytes", found=size)
     data = read_bytes(path)
     # entities can make a small file very large, and other encodings can hide them
     if b"<!ENTITY" in data or b"\0" in data:
@@ -89,7 +89,7 @@ def _items(path: Path) -> list[ElementTree.Element]:
     if tracklets.findtext("count", "").strip() not in ("", str(len(items))):
         count = tracklets.findtext("count", "").strip()
         raise FormatError(
-            path, expected=f"{count} tracklets", found=str(len(items)), advice="copy the file again"
+            path, expected=f"{count} tracklets", found=len(items), advice="copy the file again"
         )
     return items
 

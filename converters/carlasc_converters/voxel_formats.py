@@ -92,7 +92,7 @@ def _rows(file: Path, columns: tuple[int, ...]) -> AnyArray:
     rows = read_npy(file, ArrayFormat(NUMBERS, (None, None)))
     if rows.shape[1] not in columns:
         expected = f"rows of {' or '.join(map(str, columns))} columns"
-        raise FormatError(file, expected=expected, found=str(rows.shape))
+        raise FormatError(file, expected=expected, found=rows.shape)
     if not np.isfinite(rows).all():
         raise FormatError(file, expected="finite numbers", found="NaN or infinity")
     return rows

@@ -8,14 +8,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from carlasc import Grid, GridSpec
 from carlasc.core.tables import CARLA
-from carlasc.groundtruth.maps.map_files import SurfaceMesh, write_distances
+from carlasc.groundtruth.maps.map_files import MapCells, SurfaceMesh, write_distances
 
 BOX = np.argwhere(np.ones((3, 4, 5)))
 
 
 def meshed(cells, labels=None, size=(1.0, 1.0, 1.0)):
     labels = np.full(len(cells), 7) if labels is None else labels
-    return SurfaceMesh.of(cells, labels, np.zeros(3), np.array(size))
+    return SurfaceMesh.of(MapCells(cells, labels, np.zeros(3), np.array(size)))
 
 
 @pytest.mark.parametrize("corner", [(0, 0, 0), (126, -2, 7), (-1, 127, -9)])

@@ -97,15 +97,8 @@ def _write_ply(file: BinaryIO, points: PointPieces) -> None:
 
 
 def _write_pcd(file: BinaryIO, points: PointPieces) -> None:
-    kinds = list(
-        zip(
-            *((name, kind[2:], kind[1].upper()) for name, kind, *_ in _ROW_DTYPE.descr), strict=True
-        )
-    )
-    described = [
-        " ".join([word, *values])
-        for word, values in zip(("FIELDS", "SIZE", "TYPE"), kinds, strict=True)
-    ]
+    kinds = [(name, kind[2:], kind[1].upper()) for name, kind, *_ in _ROW_DTYPE.descr]
+    described = map(" ".join, zip(("FIELDS", "SIZE", "TYPE"), *kinds, strict=True))
     head = [
         f"# .PCD v0.7: {points.about}",
         "VERSION 0.7",

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, IntArray, LabelArray
+from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, IntArray, LabelArray, run_starts
 from carlasc.groundtruth.maps.cloud_files import POINT_DTYPE
 
 Part = tuple[int, int, int]
@@ -91,7 +91,7 @@ def rows_of_scan(
         np.searchsorted(begins, runs, side="right") - 1,
     )
     best = np.lexsort((sorted_labels[runs], -lengths, cell_of))
-    best = best[np.flatnonzero(np.diff(cell_of[best], prepend=-1))]
+    best = best[run_starts(cell_of[best])]
     certain = np.ones(len(order)) if sure is None else sure[order].astype(np.float64)
     votes = np.add.reduceat(certain, runs)[best] / rows["points"]
     rows["votes"] = np.maximum(np.rint(votes * _VOTE), 1)
@@ -122,7 +122,7 @@ def _added(pieces: Iterable[AnyArray]) -> AnyArray:
     """Return rows in order of their keys; rows with the same key are summed."""
     rows = np.concatenate(list(pieces))
     rows = rows[np.argsort(rows["key"], kind="stable")]
-    begins = np.flatnonzero(np.diff(rows["key"], prepend=-1))
+    begins = run_starts(rows["key"])
     added = rows[begins]
     for name in ROW_DTYPE.names[1:] if ROW_DTYPE.names else ():
         added[name] = np.add.reduceat(rows[name], begins)
@@ -216,9 +216,9 @@ class GrowingCells:
         lowest of several.
         """
         cells = rows["key"] >> _LABEL_BITS
-        begins = np.flatnonzero(np.diff(cells, prepend=-1))
+        begins = run_starts(cells)
         best = np.lexsort((rows["key"], -rows["votes"], cells))
-        best = best[np.flatnonzero(np.diff(cells[best], prepend=-1))]
+        best = best[run_starts(cells[best])]
         points, count = (
             np.zeros(len(begins), POINT_DTYPE),
             np.add.reduceat(rows["points"].astype(np.int64), begins),

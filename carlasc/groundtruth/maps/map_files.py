@@ -100,7 +100,7 @@ class MapFiles:
                 raise ArgumentError(
                     name,
                     expected=f"a file that ends in {', '.join(_ENDINGS[name])}",
-                    found=str(path),
+                    found=path,
                 )
         if not paths:
             raise ArgumentError(
@@ -128,7 +128,7 @@ class MapFiles:
             raise ArgumentError(
                 "actors",
                 expected="a file of points of a drive in `out`",
-                found=str(grid or paths.get("out")),
+                found=grid or paths.get("out"),
             )
         folder = paths["out"].with_name(f"{paths['out'].stem}_actors") if actors else None
         out, mesh, far, trajectory, boxes = (paths.get(name) for name in _ENDINGS)
@@ -137,18 +137,12 @@ class MapFiles:
     @property
     def all(self) -> list[Path]:
         """All files, and the folder."""
-        return [
-            path
-            for path in (
-                self.out,
-                self.mesh,
-                self.distance,
-                self.trajectory,
-                self.boxes,
-                self.actors,
-            )
-            if path is not None
-        ]
+        return [path for path in vars(self).values() if isinstance(path, Path)]
+
+    @property
+    def ending(self) -> str:
+        """The ending of `out`; "" without it."""
+        return "" if self.out is None else self.out.suffix.lower()
 
     def check(self, overwrite: bool) -> None:
         """Check, before hours of work, that no file is replaced and that packages are installed."""
@@ -158,10 +152,8 @@ class MapFiles:
                 found, advice = "a file" if path.is_file() else "a folder", "give another name"
                 advice = f"give `overwrite=True`, or {advice[5:]}" if is_ours else advice
                 raise ConflictError(path, expected="nothing", found=found, advice=advice)
-        is_las = self.out is not None and self.out.suffix.lower() == ".las"
-        for (module, extra), needed in zip(
-            _NEEDS, (self.mesh, self.mesh, self.distance, is_las), strict=True
-        ):
+        asked = (self.mesh, self.mesh, self.distance, self.ending == ".las")
+        for (module, extra), needed in zip(_NEEDS, asked, strict=True):
             if needed:
                 import_extra(module, extra)
         if self.boxes is not None:
@@ -172,20 +164,15 @@ class MapFiles:
         the mesh.
         """
         self.begin()
-        is_tree = self.out is not None and self.out.suffix.lower() == OCTOMAP
-        if self.out is not None and not is_tree:
+        if self.out is not None and self.ending != OCTOMAP:
             write_points(self.out, points)
-        if self.mesh is None and not is_tree:
+        if self.mesh is None and self.ending != OCTOMAP:
             return
         known = cells()
-        if self.out is not None and is_tree:
+        if self.out is not None and self.ending == OCTOMAP:
             known.write_octomap(self.out)
         if self.mesh is not None:
-            occupied = known.labels > 0
-            surface = SurfaceMesh.of(
-                known.index[occupied], known.labels[occupied], known.lower, known.size
-            )
-            surface.write(self.mesh, points.classes)
+            SurfaceMesh.of(known).write(self.mesh, points.classes)
 
 
 MESH_ENDINGS = (".ply", ".glb")
@@ -220,31 +207,16 @@ class SurfaceMesh:
     labels: IntArray
 
     @classmethod
-    def of(
-        cls,
-        cells: IntArray,
-        labels: AnyIntArray,
-        lower: FloatArray,
-        size: FloatArray,
-    ) -> SurfaceMesh:
-        """Mesh cells by marching cubes.
-
-        Args:
-            cells: (N, 3) indices of the occupied cells.
-            labels: (N,) their classes, none 0.
-            lower: (3,) lower corner of the cell (0, 0, 0), metres.
-            size: (3,) size of a cell, metres.
+    def of(cls, known: MapCells) -> SurfaceMesh:
+        """Mesh the occupied ones of some cells by marching cubes.
 
         Raises:
             DependencyError: scikit-image is not installed.
         """
-        nodes, faces, classes, count = (
-            [np.empty((0, 3), np.int64)],
-            [np.empty((0, 3), np.int64)],
-            [np.empty(0, np.int64)],
-            0,
-        )
-        for corner, volume in _blocks(cells, labels):
+        nodes, faces = [np.empty((0, 3), np.int64)], [np.empty((0, 3), np.int64)]
+        classes, count = [np.empty(0, np.int64)], 0
+        occupied = known.labels > 0
+        for corner, volume in _blocks(known.index[occupied], known.labels[occupied]):
             vertices, triangles, own = _march(volume)
             nodes.append(vertices + _STEPS * corner)
             faces.append(triangles + count)
@@ -254,7 +226,7 @@ class SurfaceMesh:
             np.concatenate(nodes), axis=0, return_index=True, return_inverse=True
         )
         return cls(
-            lower + (whole / _STEPS + 0.5) * size,
+            known.lower + (whole / _STEPS + 0.5) * known.size,
             place.reshape(-1)[np.concatenate(faces)],
             np.concatenate(classes)[first],
         )

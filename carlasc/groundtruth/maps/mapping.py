@@ -93,8 +93,8 @@ def write_map(
             drive.write_trajectory(files.trajectory)
         if files.boxes is not None:
             drive.inputs.box_table(drive.frames, refined=True).write(files.boxes)
-        if files.actors is not None and files.out is not None:
-            bodies = drive.write_actors(files.actors, files.out.suffix.lower())
+        if files.actors is not None:
+            bodies = drive.write_actors(files.actors, files.ending)
     return MapContent(points, len(drive.frames), bodies, drive.parked, drive.notes())
 
 
@@ -223,9 +223,8 @@ class DriveMap:
         table = list[dict[str, Any]]()
         with writing_folder(folder) as made:
             for number in sorted({part[0] for part in self.cells.counts} - {STATIC}):
-                about = self._about(number, self.inputs.actors.tracks[number]) | {
-                    "file": f"{number:04}{ending}"
-                }
+                about = self._about(number, self.inputs.actors.tracks[number])
+                about["file"] = f"{number:04}{ending}"
                 text = f"actor {number}, {about['class']}, metres, x forward, y left, z up"
                 write_points(made / about["file"], self._pieces(number, text))
                 table.append(about)

@@ -8,10 +8,9 @@ and a voxel without votes is unknown: see the format page, `docs/format.md#votes
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,16 +23,16 @@ from carlasc.core.arrays import (
     Uint8Array,
     Uint16Array,
 )
-from carlasc.core.choices import VoteRule as VoteRule  # noqa: PLC0414 (part of this module)
+from carlasc.core.cells import Cells, Pose, as_pose
+from carlasc.core.choices import VoteRule
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, check_rigid
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA
-from carlasc.errors import ArgumentError, FormatError
-from carlasc.storage.field_files import VOTES_DTYPE, WIDE_VOTES_DTYPE
-
-if TYPE_CHECKING:
-    from carlasc.core.cells import Pose
+from carlasc.errors import FormatError
+from carlasc.groundtruth.options import check_rule
+from carlasc.groundtruth.voting import filled, kernel
+from carlasc.storage.field_files import VOTES_DTYPE, votes_dtype
 
 _MOST_VOTES = int(np.iinfo(VOTES_DTYPE["votes"]).max)
 OCCUPIED_DTYPE = np.dtype(
@@ -79,10 +78,10 @@ class Observation:
             raise FormatError("observation points", expected="shape (N, 3) float32", found=found)
         if self.labels.shape != (len(self.points),):
             expected = f"shape ({len(self.points)},), one per point"
-            raise FormatError("observation labels", expected=expected, found=str(self.labels.shape))
+            raise FormatError("observation labels", expected=expected, found=self.labels.shape)
         if self.labels.dtype.kind != "u":
             raise FormatError(
-                "observation labels", expected="unsigned integers", found=str(self.labels.dtype)
+                "observation labels", expected="unsigned integers", found=self.labels.dtype
             )
         check_rigid(self.grid_T_sensor, "observation grid_T_sensor")
         poses, ends = np.shape(self.grid_T_sensor)[:-2], self.ends
@@ -93,7 +92,7 @@ class Observation:
             raise FormatError(
                 "observation ends",
                 expected=f"shape {poses}, rising to {len(self)}",
-                found=str(ends),
+                found=ends,
             )
 
     def __len__(self) -> int:
@@ -166,20 +165,6 @@ def count_votes(
     return ballot.votes(copy=False)
 
 
-def check_rule(rule: str, free_step_m: float) -> None:
-    """Check the rule and the distance of free samples.
-
-    Raises:
-        ArgumentError: an unknown rule, or a distance that is not positive.
-    """
-    if rule not in get_args(VoteRule):
-        raise ArgumentError("rule", expected="sensor, sample or ray", found=repr(rule))
-    if not (math.isfinite(free_step_m) and free_step_m > 0):
-        raise ArgumentError(
-            "free_step_m", expected="a positive number of metres", found=str(free_step_m)
-        )
-
-
 class Ballot:
     """Counts votes: `add` takes one observation after the other, and `votes` can be read at any
     time.
@@ -208,9 +193,6 @@ class Ballot:
         free_step_m: float = 1.5,
         keep_boxes: bool = False,
     ) -> None:
-        # Numba is loaded here, not with the module: options of commands import names of rules only.
-        from carlasc.core.cells import Cells
-        from carlasc.groundtruth.voting import filled, kernel
 
         check_rule(rule, free_step_m)
         self.spec, self.classes, self.rule, self.free_step_m = (
@@ -241,9 +223,6 @@ class Ballot:
             FormatError: a label is not below the class table's number of channels; no vote was
                 added.
         """
-        from carlasc.core.cells import as_pose
-        from carlasc.groundtruth.voting import kernel
-
         self.classes.check(observation.labels, "observation labels")
         ends = np.array([len(observation)]) if observation.ends is None else observation.ends
         self._make_room(len(observation))
@@ -267,8 +246,6 @@ class Ballot:
 
     def add_points(self, seen: Iterable[SeenClass]) -> None:
         """Add the votes of points without rays, one class after the other."""
-        from carlasc.groundtruth.voting import kernel
-
         counted = np.zeros(self.spec.num_voxels + 1, kernel.HIT_DTYPE)
         for label, voters, regions, region in seen:
             points, number = sum(one.points.shape[1] for one in voters), 0
@@ -288,7 +265,6 @@ class Ballot:
     def _widen(
         self, points: Float32Array, pose: Pose, regions: Uint16Array = _EVERYWHERE, region: int = 0
     ) -> None:
-        from carlasc.groundtruth.voting import filled
 
         ready = _ready(points, np.float32)
         filled.widen_boxes(ready, pose, self._cells, regions, region, self._boxes)
@@ -301,8 +277,6 @@ class Ballot:
     @property
     def hit(self) -> BoolArray:
         """(V,) bool: voxels with votes for a class other than free space."""
-        from carlasc.groundtruth.voting import kernel
-
         return self._tally.heads != kernel.NONE
 
     def seen(self) -> BoolArray:
@@ -316,8 +290,6 @@ class Ballot:
             copy: whether the result is independent of later observations. Without a copy, add no
                 more of them.
         """
-        from carlasc.groundtruth.voting import kernel
-
         # The lists of candidates are in the order of their first votes; `collect` sorts them, so
         # that rows do not depend on the order of observations.
         candidates = self._tally.candidates[: self._tally.used[0]]
@@ -386,8 +358,6 @@ class Votes:
         """Return the (V,) classes with most votes, ties to the lowest id, and the (V,) sums of
         votes. `counts` has the votes of class 0.
         """
-        from carlasc.groundtruth.voting import kernel
-
         labels = np.zeros(len(counts), self.classes.dtype)
         kernel.elect(self.occupied, labels, counts)
         return labels, counts
@@ -402,11 +372,7 @@ class Votes:
             (M,) `field_files.VOTES_DTYPE`, or `field_files.WIDE_VOTES_DTYPE` if class ids do not
             fit 8 bits.
         """
-        from carlasc.groundtruth.voting import kernel
-
-        votes = np.empty(
-            np.count_nonzero(self.free) + len(self.occupied),
-            VOTES_DTYPE if self.classes.dtype == np.uint8 else WIDE_VOTES_DTYPE,
-        )
+        rows = np.count_nonzero(self.free) + len(self.occupied)
+        votes = np.empty(rows, votes_dtype(self.classes))
         kernel.interleave(self.free.reshape(-1), self.occupied, votes, _MOST_VOTES)
         return votes

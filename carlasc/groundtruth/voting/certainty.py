@@ -39,6 +39,7 @@ from carlasc.core.arrays import (
     IntArray,
     LabelArray,
     Uint16Array,
+    run_starts,
 )
 from carlasc.core.classes import ClassTable
 from carlasc.core.compiling import cached, inlined, jit
@@ -197,7 +198,7 @@ class VoxelCertainty:
             raise FormatError(
                 "evidence views",
                 expected=f"shape {self.occupied.shape}",
-                found=str(self.views.shape),
+                found=self.views.shape,
             )
 
 
@@ -222,10 +223,7 @@ def class_shares(votes: AnyArray, classes: ClassTable) -> AnyArray:
     voxel, label = np.divmod(pairs, classes.num_channels)
     of_pair = np.bincount(place, votes["votes"], len(pairs))
     of_voxel = np.bincount(voxel, of_pair)
-    shares = np.zeros(
-        len(pairs),
-        field_files.VOTES_DTYPE if classes.dtype == np.uint8 else field_files.WIDE_VOTES_DTYPE,
-    )
+    shares = np.zeros(len(pairs), field_files.votes_dtype(classes))
     shares["voxel"], shares["label"] = voxel, label
     shares["votes"] = np.floor(of_pair / of_voxel[voxel] * layout.CERTAIN)
     return shares[shares["votes"] > 0]
@@ -294,12 +292,12 @@ def agree(votes: AnyArray, spec: GridSpec, classes: ClassTable) -> ClassConsensu
         classes: class table of the labels.
     """
     labels = np.zeros(spec.num_voxels, classes.dtype)
-    dtype = field_files.VOTES_DTYPE if classes.dtype == np.uint8 else field_files.WIDE_VOTES_DTYPE
+    dtype = field_files.votes_dtype(classes)
     if not len(votes):
         return ClassConsensus(labels, np.empty(0, dtype), 0.0)
     counted = np.bincount(votes["label"]) > 0
     present, own = np.flatnonzero(counted), (np.cumsum(counted) - 1)[votes["label"]]
-    begins = np.append(np.flatnonzero(np.diff(votes["voxel"], prepend=-1)), len(votes))
+    begins = np.append(run_starts(votes["voxel"]), len(votes))
     voxels = votes["voxel"][begins[:-1]]
     # dense, so that the compiled loops find a neighbour without a search
     rows = np.full(spec.num_voxels, -1, np.int32)

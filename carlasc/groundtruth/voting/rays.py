@@ -187,7 +187,10 @@ class RayBlock(NamedTuple):
 @jit
 def empty_rays(n: int) -> RayBlock:
     """Return memory for a block of `n` rays."""
-    x, y, z, dx, dy, dz = (
+    return RayBlock(
+        np.empty(n),
+        np.empty(n),
+        np.empty(n),
         np.empty(n),
         np.empty(n),
         np.empty(n),
@@ -195,7 +198,6 @@ def empty_rays(n: int) -> RayBlock:
         np.empty(n),
         np.empty(n),
     )
-    return RayBlock(x, y, z, dx, dy, dz, np.empty(n), np.empty(n), np.empty(n))
 
 
 @inlined

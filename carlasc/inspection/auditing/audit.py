@@ -170,7 +170,7 @@ def audit(
     start = time.perf_counter()
     if made_from is not None and not made_from[0] <= 0 <= made_from[1]:
         raise ArgumentError(
-            "made_from", expected="a range that contains 0, such as -30:30", found=str(made_from)
+            "made_from", expected="a range that contains 0, such as -30:30", found=made_from
         )
     if run.part.count > 1 and keep is None:
         raise ArgumentError(

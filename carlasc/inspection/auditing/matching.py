@@ -172,7 +172,7 @@ class MatchedGrids:
         where = f"{self.grids.location}: frame {self.grids.name_of(frame)}"
         if labels.size != self.spec.num_voxels:
             expected, advice = f"{self.spec.num_voxels} voxels", "check the size in params.json"
-            raise FormatError(where, expected=expected, found=str(labels.size), advice=advice)
+            raise FormatError(where, expected=expected, found=labels.size, advice=advice)
         labels = labels.reshape(self.spec.size)
         occupied = labels != (0 if self.grids.classes is None else self.grids.classes.free)
         if isinstance(self.grids, VoxelFrames) and self.grids.classes is not None:

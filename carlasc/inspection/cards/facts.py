@@ -256,7 +256,7 @@ def gather(
         ArgumentError, FormatError, CarlascError: see `licensed_parts` and `stats`.
     """
     if every < 1:
-        raise ArgumentError("every", expected="1 or more", found=str(every))
+        raise ArgumentError("every", expected="1 or more", found=every)
     sequences = {path: one for path, one in source.sequences().items() if one.fields()}
     if not sequences:
         advice = "make them with `carlasc regrid`"

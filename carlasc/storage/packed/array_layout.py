@@ -101,7 +101,8 @@ class FieldLayout:
         if packing.kind == "grid":
             size: dict[str, Any] = {"shape": list(typical)}
         else:
-            size = {"chunk": max(_round_up(int(typical[0] * _HEADROOM)), LEAST)}
+            # a multiple of 256
+            size = {"chunk": max(-(-int(typical[0] * _HEADROOM) // 256) * 256, LEAST)}
         about = {
             "type": FIELD,
             "version": VERSION,
@@ -200,7 +201,7 @@ class FieldLayout:
             raise FormatError(
                 "its array", expected=f"shape {tuple(self.attributes['shape'])}, as in earlier "
                                       f"frames",
-                found=str(array.shape),
+                found=array.shape,
             )  # fmt: skip
         counts, chunks = {}, {}
         parts = self.packing.split(array)
@@ -225,7 +226,7 @@ class FieldLayout:
             "its array",
             expected=f"at most {self.frame_shape(widest)[-1]} elements ({_SLOTS} times a typical "
             f"frame)",
-            found=str(values.shape[-1]),
+            found=values.shape[-1],
             advice="leave the frame out, or pack to an .h5 store",
         )
 
@@ -324,8 +325,3 @@ def field_node(field: str) -> str:
 def document_node(name: str) -> str:
     """Return the node of a text file in the group of its sequence."""
     return f"documents/{name}"
-
-
-def _round_up(count: int) -> int:
-    """Round the elements of a chunk up to a multiple of 256."""
-    return -(-count // 256) * 256

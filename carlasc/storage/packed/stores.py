@@ -51,10 +51,10 @@ class PackOptions:
         check_types(PackOptions, vars(self))
         if self.lossy_mm is not None and not 0 < self.lossy_mm <= 1000:
             raise ArgumentError(
-                "lossy_mm", expected="millimetres above 0, up to 1000", found=str(self.lossy_mm)
+                "lossy_mm", expected="millimetres above 0, up to 1000", found=self.lossy_mm
             )
         if not 1 <= self.block <= 1024:
-            raise ArgumentError("block", expected="1 to 1024 frames", found=str(self.block))
+            raise ArgumentError("block", expected="1 to 1024 frames", found=self.block)
 
     @property
     def scale_m(self) -> float | None:
@@ -276,7 +276,7 @@ class FieldWriter(ABC):
         last = next(reversed(self.frames), -1)
         if frame <= last:
             raise FormatError(
-                "its number", expected=f"frames in rising order, above {last}", found=str(frame)
+                "its number", expected=f"frames in rising order, above {last}", found=frame
             )
         self.entry.check(array, "its array")
         self.frames[frame] = self.write(frame, array)

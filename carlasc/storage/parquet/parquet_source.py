@@ -258,7 +258,7 @@ def footer_checksum(tree: Tree, path: str) -> int:
     length = int.from_bytes(end[:4], "little")
     if length > _LONGEST:
         raise FormatError(
-            tree.where(path), expected=f"a footer of at most {_LONGEST} bytes", found=str(length)
+            tree.where(path), expected=f"a footer of at most {_LONGEST} bytes", found=length
         )
     return zlib.crc32(tree.read_range(path, -_END - length, 0))
 

@@ -81,7 +81,7 @@ def split_columns(
         raise FormatError(
             "its labels",
             expected=f"{attributes['label_bytes']} bytes each, as in the first frame",
-            found=str(array.dtype["label"].itemsize),
+            found=array.dtype["label"].itemsize,
         )
     if entry.kind == "velocities":
         velocity = dict(zip(_VELOCITY, np.ascontiguousarray(array["velocity"].T), strict=True))

@@ -58,7 +58,7 @@ class Cache:
         check_types(Cache, vars(self))
         if self.max_bytes <= 0:
             raise ArgumentError(
-                "max_bytes", expected="a number of bytes above 0", found=str(self.max_bytes)
+                "max_bytes", expected="a number of bytes above 0", found=self.max_bytes
             )
 
     def create(self) -> None:

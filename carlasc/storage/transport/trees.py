@@ -318,7 +318,7 @@ def check_length(data: _Data, expected: int, where: str) -> _Data:
         raise FormatError(
             where,
             expected=f"{expected} bytes in this range",
-            found=str(len(data)),
+            found=len(data),
             advice="the file may be truncated",
         )
     return data

@@ -27,6 +27,7 @@ from carlasc.viewing.rendering.meshes import (
     SIDES,
     exposed_cells,
     face_corners,
+    quad_triangles,
     split_arcs,
     surrounded,
 )
@@ -66,8 +67,7 @@ def class_surfaces(grid: Grid) -> Iterator[tuple[int, Triangles]]:
     corners, normals, owners = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     for label in np.unique(owners).tolist():
         chosen = owners == label
-        first = 4 * np.arange(np.count_nonzero(chosen), dtype=np.uint32)[:, None, None]
-        indices = (first + np.array([[0, 1, 2], [0, 2, 3]], np.uint32)).reshape(-1, 3)
+        indices = quad_triangles(int(np.count_nonzero(chosen))).astype(np.uint32)
         points = corners[chosen].reshape(-1, 3)
         yield label, Triangles(points, np.repeat(normals[chosen], 4, axis=0), indices)
 

@@ -196,14 +196,13 @@ class FoxgloveWriter:
         """Yield each class of a cylindrical grid with the faces of its voxels."""
         m = self._messages
         for label, surface in class_surfaces(grid):
-            points = [m.Point3(x=x, y=y, z=z) for x, y, z in surface.corners.tolist()]
             color = self._rgba(panel.colors.by_id[label].tolist())
             name = panel.colors.table.names.get(label, f"class {label}")
             yield (
                 name,
                 m.TriangleListPrimitive(
                     pose=self._pose(np.eye(4)),
-                    points=points,
+                    points=self._points3(surface.corners),
                     color=color,
                     indices=surface.indices.reshape(-1).tolist(),
                 ),
@@ -250,9 +249,12 @@ class FoxgloveWriter:
             type=m.LinePrimitiveLineType.LineStrip,
             pose=self._pose(np.eye(4)),
             thickness=_LINE_M,
-            points=[m.Point3(x=x, y=y, z=z) for x, y, z in points.tolist()],
+            points=self._points3(points),
             color=color,
         )
+
+    def _points3(self, points: AnyFloatArray) -> list[Any]:
+        return [self._messages.Point3(x=x, y=y, z=z) for x, y, z in points.tolist()]
 
     def _pose(self, dst_T_src: Transform) -> Any:
         return self._messages.Pose(

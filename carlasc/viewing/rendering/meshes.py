@@ -57,10 +57,19 @@ class QuadMesh:
 
     def triangles(self) -> tuple[Float32Array, Int32Array]:
         """Return vertices (4 Q, 3) and triangles (2 Q, 3): quad q is triangles 2 q and 2 q + 1."""
-        first = 4 * np.arange(len(self), dtype=np.int32)[:, None, None]
-        return self.corners.reshape(-1, 3), (
-            first + np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-        ).reshape(-1, 3)
+        return self.corners.reshape(-1, 3), quad_triangles(len(self))
+
+
+def quad_triangles(count: int) -> Int32Array:
+    """Return (2 N, 3) the corners of the triangles of `count` quads, of which each has four."""
+    first = 4 * np.arange(count, dtype=np.int32)[:, None, None]
+    return (first + np.array([[0, 1, 2], [0, 2, 3]], np.int32)).reshape(-1, 3)
+
+
+def _normals_of(corners: AnyFloatArray) -> AnyFloatArray:
+    """Return the (N, 3) unit normals of quads with (N, 4, 3) corners."""
+    normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
 def join(meshes: Sequence[QuadMesh]) -> QuadMesh:
@@ -80,12 +89,10 @@ def quads(
     gives the normals.
     """
     points = np.asarray(corners, np.float32).reshape(-1, 4, 3)
-    normals = np.cross(points[:, 2] - points[:, 0], points[:, 3] - points[:, 1])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     count = len(points)
     return QuadMesh(
         points,
-        normals,
+        _normals_of(points),
         np.broadcast_to(np.asarray(color, np.uint8), (count, 3)),
         np.ones((count, 4), np.float32),
         np.full((count, 4), edges),
@@ -190,10 +197,7 @@ def face_corners(
     corners = spec.from_axes(
         np.stack([spec.edges(a)[lattice[..., a]] for a in range(3)], axis=-1).astype(np.float64)
     )
-    normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-    normals *= 2 * side - 1
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return corners, normals
+    return corners, (2 * side - 1) * _normals_of(corners)
 
 
 def _faces(

@@ -59,7 +59,7 @@ def overlay(
     """
     started, scene = time.monotonic(), as_scene(source)
     if not 0 <= opacity <= 1:
-        raise ArgumentError("opacity", expected="0 to 1", found=str(opacity))
+        raise ArgumentError("opacity", expected="0 to 1", found=opacity)
     check_target(out, STILLS + FILMS, overwrite)
     reader = scene.open("grid")
     model = camera_named(reader.data.sequence, camera)

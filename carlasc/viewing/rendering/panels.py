@@ -285,7 +285,7 @@ def plan_cells(renderers: Sequence[FrameRenderer], film: bool) -> list[list[Cell
         raise ArgumentError(
             "frames",
             expected=f"at most {MOST_PANELS} panels",
-            found=str(count),
+            found=count,
             advice="choose fewer with `every`",
         )
     return pictures
@@ -315,7 +315,7 @@ def caption_panels(cells: Sequence[Cell], texts: Sequence[str], film: bool) -> t
     parts = _parts_of(cells)
     if texts and len(texts) != len(parts):
         raise ArgumentError(
-            "captions", expected=f"one for each of the {len(parts)} panels", found=str(len(texts))
+            "captions", expected=f"one for each of the {len(parts)} panels", found=len(texts)
         )
     if not texts:
         rows = [row[:2] + row[3:] for row in parts] if film else parts

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,7 +16,7 @@ from carlasc.core.arrays import Uint8Array
 from carlasc.core.classes import TableUse
 from carlasc.errors import ArgumentError, check_types
 from carlasc.running.processes import run_all
-from carlasc.running.spreading import Run, StepCounter
+from carlasc.running.spreading import Progress, Run, StepCounter
 from carlasc.storage import Sequence as StoredSequence
 from carlasc.storage import Source
 from carlasc.storage.files import AnyPath, check_target
@@ -262,7 +262,7 @@ def _plan_shots(
 
 
 def _reported(
-    pictures: Iterator[Uint8Array], total: int, progress: Callable[[int, int], None] | None
+    pictures: Iterator[Uint8Array], total: int, progress: Progress | None
 ) -> Iterator[Uint8Array]:
     step = StepCounter(progress, total)
     for picture in pictures:

@@ -64,7 +64,7 @@ class StyleOptions:
         if self.dpi is not None and not 30 <= self.dpi <= 2400:
             raise ArgumentError("dpi", expected="30 to 2400 pixels per inch", found=f"{self.dpi:g}")
         if self.columns is not None and self.columns < 1:
-            raise ArgumentError("columns", expected="1 or more", found=str(self.columns))
+            raise ArgumentError("columns", expected="1 or more", found=self.columns)
         check_size(self.sheet.size)
 
     @property

@@ -247,9 +247,7 @@ class KittiExporter(FrameExporter):
             flow = np.asarray(sequence.read("flow", frame))
             if len(flow) != len(labels):
                 where = f"{sequence.location}: flow of frame {frame}"
-                raise FormatError(
-                    where, expected=f"{len(labels)} rows, as labels", found=str(len(flow))
-                )
+                raise FormatError(where, expected=f"{len(labels)} rows, as labels", found=len(flow))
             labels = np.where(
                 np.linalg.norm(flow, axis=1) > _MOVING_M_S, _TO_MOVING[labels], labels
             )
@@ -346,7 +344,7 @@ def _instances(sequence: storage.Sequence, frame: int, count: int) -> Uint32Arra
         f"{sequence.location}: instances of frame {frame}",
     )
     if len(instances) != count:
-        raise FormatError(where, expected=f"{count} rows, as labels", found=str(len(instances)))
+        raise FormatError(where, expected=f"{count} rows, as labels", found=len(instances))
     numbered = instances[instances > 0]
     if np.isin(numbered >> 16, CLASS_PARTS >> 16).all():
         return (instances & 0xFFFF).astype(np.uint32)
@@ -354,7 +352,7 @@ def _instances(sequence: storage.Sequence, frame: int, count: int) -> Uint32Arra
         raise FormatError(
             where,
             expected="numbers of at most 16 bits",
-            found=str(numbered.max()),
+            found=numbered.max(),
             advice="number the actors from 1 before exporting",
         )
     return instances

@@ -167,7 +167,7 @@ class OpenSceneFlowExporter(SequenceExporter):
             if len(array) != len(points):
                 where = f"{sequence.location}: {name} of frame {frame}"
                 raise FormatError(
-                    where, expected=f"{len(points)} rows, as points", found=str(len(array))
+                    where, expected=f"{len(points)} rows, as points", found=len(array)
                 )
         points = mirror_points(points) if left else points
         pose = _pose(sequence, frame)
@@ -307,7 +307,7 @@ class _LogFile(SequenceFile):
             self._numbers.setdefault(instance, len(self._numbers))
         if len(self._numbers) > np.iinfo(np.int16).max + 1:
             raise FormatError(
-                self._path, expected="at most 32767 objects", found=str(len(self._numbers) - 1)
+                self._path, expected="at most 32767 objects", found=len(self._numbers) - 1
             )
         return np.array([self._numbers[instance] for instance in actors.tolist()], np.int16)[
             np.searchsorted(actors, instances)

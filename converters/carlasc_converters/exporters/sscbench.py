@@ -59,7 +59,7 @@ class SscBenchExporter(GridExporter):
     ) -> None:
         super().__init__(grid, predictions=predictions)
         if every < 1:
-            raise ArgumentError("every", expected="1 or more", found=str(every))
+            raise ArgumentError("every", expected="1 or more", found=every)
         self.every = every
 
     @property

@@ -132,7 +132,7 @@ def record(
     check_choice("traffic", traffic, TrafficLevel)
     lidar = lidar or Lidar()
     if lidar.scattered or lidar.elevations_deg:
-        raise ArgumentError("lidar", expected="equal angles between channels", found=str(lidar))
+        raise ArgumentError("lidar", expected="equal angles between channels", found=lidar)
     models = roof_cameras(cameras)
     images = photo_fields(models, CAMERA_KINDS)
     if bev or cameras:

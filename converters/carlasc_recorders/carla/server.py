@@ -315,7 +315,7 @@ def decode_sweep(measurement: Any) -> SemanticSweep:
         raise FormatError(
             "semantic LiDAR",
             expected=f"a multiple of {DETECTION.itemsize} bytes",
-            found=str(len(data)),
+            found=len(data),
             advice="check that client and server have the same version",
         )
     pose = np.array(measurement.transform.get_matrix(), np.float64)
