@@ -12,7 +12,6 @@ from carlasc.converting.assembling import AxesAndClasses
 from carlasc.converting.protocol import Recording
 from carlasc.core.arrays import Float32Array, FloatArray, Uint32Array
 from carlasc.core.boxes import Boxes
-from carlasc.core.geometry import invert
 from carlasc.errors import ArgumentError, FormatError, first_names
 from carlasc.motion.box_table import BoxTable
 from carlasc.storage.files import AnyPath
@@ -54,7 +53,7 @@ class GivenBoxes:
         return cls(table, str(path), np.array(labels, np.uint32))
 
     def at_scans(
-        self, recording: Recording, times: FloatArray, first_T_scan: FloatArray
+        self, recording: Recording, times: FloatArray, first_T_scan: FloatArray | None
     ) -> tuple[dict[int, Boxes], list[str]]:
         """Return the boxes of each scan that has any, by frame number, in the frame of the scan;
         and remarks, one line each. Tracks begin at 1.
@@ -62,27 +61,23 @@ class GivenBoxes:
         Args:
             recording: the recording, with the frames that are converted.
             times: (F,) seconds by frame number, by the recording's clock.
-            first_T_scan: (F, 4, 4) poses by frame number, right-handed.
+            first_T_scan: (F, 4, 4) poses by frame number, right-handed; None if they are not
+                estimated yet: then times are checked, and no box is returned.
 
         Raises:
             FormatError: the boxes are those of another drive.
         """
         table, numbers = self.table, [handle.number for handle in recording.frames]
-        seconds, poses = (times - times[0])[numbers], first_T_scan[numbers]
+        seconds = (times - times[0])[numbers]
+        poses = None if first_T_scan is None else first_T_scan[numbers]
         index = table.frames_of(seconds, poses, self.where, recording.location)
-        late_s = seconds[index] - table.times
-        centers = table.values[:, :3] + np.nan_to_num(table.values[:, 7:10]) * late_s[:, None]
-        half = table.values[:, 6] / 2
-        turns = np.column_stack([np.cos(half), half * 0, half * 0, np.sin(half)])
-        tracks = (table.numbers + max(1 - int(table.numbers.min()), 0)).astype(np.uint32)
-        columns = (tracks, self.labels, centers, turns, table.values[:, 3:6], tracks > 0)
-        boxes = dict[int, Boxes]()
-        for one in np.unique(index[index >= 0]).tolist():
-            own = Boxes(*(column[index == one] for column in columns))
-            boxes[numbers[one]] = own.transform(invert(poses[one]))
+        if poses is None:
+            return {}, []
+        placed = table.boxes_at(index, seconds, poses, self.labels)
         out = np.flatnonzero(index < 0)
         names = first_names(f"{table.numbers[row]} at {table.times[row]:g} s" for row in out)
         note = f"{len(out)} of {len(index)} boxes of {self.where} are at no scan, and are left out"
+        boxes = {numbers[one]: own for one, own in placed.items()}
         return boxes, [f"{note}: {names}"] if len(out) else []
 
     def check(self, boxes: Mapping[int, Boxes], scans: Mapping[int, Float32Array]) -> None:

@@ -152,17 +152,13 @@ class RecordingPlan(Examined):
         self.place_boxes()
 
     def place_boxes(self) -> None:
-        """Take the boxes of the given table, if there is one, under the poses, if these are known.
+        """Take the boxes of the given table, if there is one.
 
         Raises:
             FormatError: they are those of another drive.
         """
-        if self.given is not None and self.poses is not None:
-            self.boxes, notes = self.given.at_scans(self.recording, self.times, self.poses)
-            self.notes += notes
-            if not self.force:
-                frames = [one for one in self.recording.frames if one.number in self.boxes]
-                self.given.check(self.boxes, _some_scans(self.recording, frames))
+        if self.given is not None:
+            self.boxes = placed_boxes(self.given, self, force=self.force)
 
     @property
     def rig(self) -> Rig:
@@ -193,6 +189,28 @@ class RecordingPlan(Examined):
         return VehicleMotion(
             Trajectory(self.trajectory.world_T_vehicle[near], self.trajectory.seconds[near]), now
         )
+
+
+def placed_boxes(given: GivenBoxes, seen: Examined, *, force: bool) -> dict[int, Boxes]:
+    """Return the given boxes of each scan that has any, by frame number, in the frame of the scan;
+    none until poses are known. Remarks become notes.
+
+    Args:
+        given: the boxes.
+        seen: the recording, with its times, if it has any, and its poses, if they are known.
+        force: whether boxes without points are accepted.
+
+    Raises:
+        FormatError: they are those of another drive, by their times, places or points.
+    """
+    if seen.poses is None and not seen.has_times:
+        return {}
+    boxes, notes = given.at_scans(seen.recording, seen.times, seen.poses)
+    seen.notes += notes
+    if boxes and not force:
+        frames = [one for one in seen.recording.frames if one.number in boxes]
+        given.check(boxes, _some_scans(seen.recording, frames))
+    return boxes
 
 
 def choose_recordings(
