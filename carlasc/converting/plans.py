@@ -205,10 +205,14 @@ def placed_boxes(given: GivenBoxes, seen: Examined, *, force: bool) -> dict[int,
     """
     if seen.poses is None and not seen.has_times:
         return {}
-    boxes, notes = given.at_scans(seen.recording, seen.times, seen.poses)
+    scans = seen.recording.frames
+    numbers = [handle.number for handle in scans]
+    poses = None if seen.poses is None else seen.poses[numbers]
+    seconds = (seen.times - seen.times[0])[numbers]
+    boxes, _, notes = given.at_scans(numbers, seconds, poses, seen.recording.location)
     seen.notes += notes
     if boxes and not force:
-        frames = [one for one in seen.recording.frames if one.number in boxes]
+        frames = [one for one in scans if one.number in boxes]
         given.check(boxes, _some_scans(seen.recording, frames))
     return boxes
 
@@ -472,7 +476,7 @@ def plan_recording(
         ConflictError: the output has another grid in the place of the voxels.
     """
     target = output.of(converter)
-    given = None if output.boxes is None else GivenBoxes.read(output.boxes, target)
+    given = None if output.boxes is None else GivenBoxes.read(output.boxes, target.classes)
     writer = sink.sequence(sequence_path(recording))
     grew = is_provisional(writer)
     known = options.force or (writer.read_document(layout.POSES) is not None and not grew)

@@ -104,7 +104,7 @@ def preview(
     chosen, given, previews = FrameRange.of(frames), None, []
     if layout.boxes is not None:
         only("boxes", {one.name: one for one in recordings}, ONE_FRAME)
-        given = GivenBoxes.read(layout.boxes, layout.of(converter))
+        given = GivenBoxes.read(layout.boxes, layout.of(converter).classes)
     for recording in recordings:
         seen = examine(
             recording, converter, poses, frames=chosen, level=layout.level, known=poses.force

@@ -13,9 +13,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from carlasc.core.arrays import FloatArray, IntArray, Uint32Array
-from carlasc.core.boxes import Boxes
-from carlasc.core.geometry import Transform, invert, rotate_vectors, transform_points
+from carlasc.core.arrays import FloatArray, IntArray
+from carlasc.core.geometry import Transform, rotate_vectors, transform_points
 from carlasc.errors import (
     ArgumentError,
     FormatError,
@@ -199,31 +198,6 @@ class BoxTable:
         frames = np.full(len(index), -1)
         frames[kept] = index[kept]
         return frames
-
-    def boxes_at(
-        self, index: IntArray, times: FloatArray, poses: FloatArray, labels: Uint32Array
-    ) -> dict[int, Boxes]:
-        """Return the boxes of each frame that has any, by its index, in the frame of its scan.
-
-        Each box is moved by its velocity to the time of its frame. Rows are in the order of the
-        table. Tracks are the numbers, so shifted that they begin at 1 if any is below 1.
-
-        Args:
-            index: (R,) index of the frame of each box, as `frames_of` returns it.
-            times: (F,) seconds of the frames.
-            poses: (F, 4, 4) world_T_sensor, in the frame of the table.
-            labels: (R,) class ids.
-        """
-        late_s = times[index] - self.times
-        centers = self.values[:, :3] + np.nan_to_num(self.values[:, 7:10]) * late_s[:, None]
-        half = self.values[:, 6] / 2
-        turns = np.column_stack([np.cos(half), half * 0, half * 0, np.sin(half)])
-        tracks = (self.numbers + max(1 - int(self.numbers.min()), 0)).astype(np.uint32)
-        columns = (tracks, labels, centers, turns, self.values[:, 3:6], tracks > 0)
-        return {
-            one: Boxes(*(column[index == one] for column in columns)).transform(invert(poses[one]))
-            for one in np.unique(index[index >= 0]).tolist()
-        }
 
     def write(self, path: AnyPath) -> None:
         """Write the table; an existing file is replaced.
