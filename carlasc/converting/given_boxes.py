@@ -75,12 +75,15 @@ class GivenBoxes:
         if poses is None:
             return {}, [], []
         late_s = times[index] - table.times
-        centers = table.values[:, :3] + np.nan_to_num(table.values[:, 7:10]) * late_s[:, None]
+        velocity = np.nan_to_num(table.values[:, 7:10])
+        centers = table.values[:, :3] + velocity * late_s[:, None]
         half = table.values[:, 6] / 2
         turns = np.column_stack([np.cos(half), half * 0, half * 0, np.sin(half)])
-        tracks = (table.numbers + max(1 - int(table.numbers.min()), 0)).astype(np.uint32)
+        more = max(1 - int(table.numbers.min()), 0)
+        tracks = (table.numbers + more).astype(np.uint32)
         columns = (tracks, self.labels, centers, turns, table.values[:, 3:6], tracks > 0)
-        boxes, rows = dict[int, Boxes](), list[IntArray]()
+        boxes = dict[int, Boxes]()
+        rows = list[IntArray]()
         for one in np.unique(index[index >= 0]).tolist():
             rows.append(np.flatnonzero(index == one))
             own = Boxes(*(column[index == one] for column in columns))

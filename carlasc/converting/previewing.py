@@ -101,7 +101,9 @@ def preview(
     """
     converter = open_converter(name, Path(source), options)
     recordings = choose_recordings(find_recordings(converter), Path(source), sequences, split)
-    chosen, given, previews = FrameRange.of(frames), None, []
+    chosen = FrameRange.of(frames)
+    given = None
+    previews = []
     if layout.boxes is not None:
         only("boxes", {one.name: one for one in recordings}, ONE_FRAME)
         given = GivenBoxes.read(layout.boxes, layout.of(converter).classes)

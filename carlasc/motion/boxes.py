@@ -91,13 +91,18 @@ def sequence_boxes(
     poses = np.stack([sequence.read_pose(frame) for frame in frames])
     boxes = {frame: own for frame in frames if (own := sequence.boxes(frame)) is not None}
     if sequence.metadata.axes == "left":
-        poses, boxes = mirror_poses(poses), {f: mirror_boxes(own) for f, own in boxes.items()}
+        poses = mirror_poses(poses)
+        boxes = {frame: mirror_boxes(own) for frame, own in boxes.items()}
     return sequence.times_of(frames), poses, boxes
 
 
 def velocities_of(tracks: Sequence[Track], frame: int, boxes: Boxes) -> FloatArray:
     """Return (N, 3) m/s, world: the velocity at a frame of the track of each of its boxes."""
-    own = {t.instance: v for t in tracks if (v := t.velocity_at(frame)) is not None}
+    own = {
+        track.instance: velocity
+        for track in tracks
+        if (velocity := track.velocity_at(frame)) is not None
+    }
     return np.array([own[number] for number in boxes.tracks.tolist()]).reshape(-1, 3)
 
 
