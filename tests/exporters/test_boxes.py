@@ -16,7 +16,7 @@ from carlasc_converters.ncore_classes import class_of_name
 from converters.formats import nuscenes as nusc
 from converters.formats.kitti_drive import small_drive
 from converters.formats.kitti_tracking import TYPES, write_tracking
-from exporters.test_opensceneflow import CARLA, DRIVE, write_drive
+from exporters.test_opensceneflow import CARLA, DRIVE, scan_boxes, write_drive
 from helpers.converters.ncore_files import START_US, contents, write_store
 from helpers.errors import raises
 from typer.testing import CliRunner
@@ -59,12 +59,6 @@ def translation_of(pose):
     moved = np.eye(4)
     moved[:3, 3] = pose[:3, 3]
     return moved
-
-
-def scan_boxes(drive, frame):
-    return drive.boxes(frame, CARLA).transform(
-        np.linalg.inv(translation_of(drive.sensors[0].vehicle_T_sensor))
-    )
 
 
 def read_labels(file, classes=("Car", "Pedestrian")):
