@@ -1,5 +1,5 @@
 """Tracked boxes as the files of KITTI's tracking benchmark: see the page
-`docs/commands/export.md#kitti-tracking`.
+`docs/commands/export.md#boxes`.
 """
 
 from __future__ import annotations

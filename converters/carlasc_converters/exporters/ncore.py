@@ -1,5 +1,5 @@
 """Tracked boxes as a store of NCore, version 4, with the component `cuboids`, beside the stores of
-a recording: see the page `docs/commands/export.md#ncore`.
+a recording: see the page `docs/commands/export.md#boxes`.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """Tracked boxes as the results that nuScenes' devkit evaluates, of tracking and of detection: see
-the page `docs/commands/export.md#nuscenes`.
+the page `docs/commands/export.md#boxes`.
 """
 
 from __future__ import annotations
