@@ -6,9 +6,11 @@ from .exporter import Files as Files
 from .exporter import FrameExporter as FrameExporter
 from .exporter import SequenceExporter as SequenceExporter
 from .exporter import SequenceFile as SequenceFile
+from .exporter import WholeFileExporter as WholeFileExporter
 from .exporting import ExportResult as ExportResult
 from .exporting import export as export
 from .following import follow as follow
+from .given_boxes import GivenBoxes as GivenBoxes
 from .mapping import MapExtras as MapExtras
 from .mapping import MapResult as MapResult
 from .mapping import RecordingOptions as RecordingOptions

@@ -67,6 +67,11 @@ class Exporter(ABC):
         """
         return vars(self)
 
+    @property
+    def of_one(self) -> str | None:
+        """The name of an option that belongs to one sequence, so that only one can be exported."""
+        return None
+
     def check_output(self, source: str, root: Path) -> tuple[int, list[str]] | None:
         """Check the files in `root` instead of an export, if an option requests that.
 
@@ -182,3 +187,51 @@ class SequenceExporter(Exporter):
         Raises:
             CarlascError: the frame cannot be read, or cannot be expressed in the other format.
         """
+
+
+class _Whole(SequenceFile):
+    """A file that has all frames already."""
+
+    def __exit__(self, *error: object) -> None:
+        """Do nothing."""
+
+    def add(self, frame: int, content: Mapping[str, AnyArray]) -> None:
+        """Do nothing."""
+
+
+class WholeFileExporter(SequenceExporter):
+    """Writes one small file per sequence, which is made at once from all frames.
+
+    Frames that cannot be read end the export.
+    """
+
+    @abstractmethod
+    def encode(self, sequence: storage.Sequence) -> tuple[bytes, list[str]]:
+        """Return the content of the file of a sequence, and notes for the user, one line each.
+
+        Raises:
+            CarlascError: the sequence cannot be read, or cannot be expressed in the other format.
+        """
+
+    def check(self, sequence: storage.Sequence) -> list[str]:
+        """Check that the file can be made."""
+        return self.encode(sequence)[1]
+
+    def folders(self, names: Sequence[str]) -> dict[str, str]:
+        """Return the root for each name: the name is in that of the file."""
+        return dict.fromkeys(names, ".")
+
+    def frames_in(self, path: Path, sequence: storage.Sequence) -> Collection[int]:
+        """Return all frames, as files are written as a whole; `export` writes them always again,
+        because they may depend on other files than the sequence.
+        """
+        return self.frames(sequence)
+
+    def open(self, path: Path, sequence: storage.Sequence) -> SequenceFile:
+        """Write the file."""
+        path.write_bytes(self.encode(sequence)[0])
+        return _Whole()
+
+    def make_frame(self, sequence: storage.Sequence, frame: int) -> Mapping[str, AnyArray]:
+        """Return nothing: frames are not made one by one."""
+        return {}

@@ -19,6 +19,7 @@ from carlasc.converting.exporter import (
     FrameExporter,
     SequenceExporter,
     SequenceFile,
+    WholeFileExporter,
 )
 from carlasc.converting.protocol import Failure, check_outside
 from carlasc.converting.registry import load_exporter, read_options
@@ -33,7 +34,9 @@ from carlasc.errors import (
     StorageError,
     check_choice,
     check_types,
+    only,
 )
+from carlasc.motion.box_table import ONE_FRAME
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Part, Run, StepCounter
 from carlasc.storage import layout
@@ -152,8 +155,11 @@ def export(
     places = sorted(f"{place}/cartesian" for place in (*share.own, *share.others))
     names = [identity_of(place)[1] for place in places] if share.others else [*every]
     folders = exporter.folders(names)
+    wanted = _choose(every, names, sequences, opened.location)
+    if exporter.of_one is not None:
+        only(exporter.of_one, {sequence.name: sequence for sequence in wanted}, ONE_FRAME)
     chosen, notes = [], []
-    for sequence in _choose(every, names, sequences, opened.location):
+    for sequence in wanted:
         notes += exporter.check(sequence)
         chosen.append(_exported(exporter, sequence, folders))
         if not chosen[-1].frames:
@@ -494,7 +500,8 @@ class _SequenceExport:
         """
         exporter, sequence = self.exporter, exported.sequence
         assert isinstance(exporter, SequenceExporter)
-        if not self._again and _is_whole(exporter, exported, folder):
+        again = self._again or isinstance(exporter, WholeFileExporter)
+        if not again and _is_whole(exporter, exported, folder):
             self._skip(len(exported.frames))
             return {}
         path = folder / exporter.file(sequence)

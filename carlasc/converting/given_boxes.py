@@ -1,17 +1,16 @@
-"""Boxes of a table that a conversion takes, instead of those of the data set."""
+"""Boxes of a table that a conversion or an export takes, instead of those of the data set."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
-from carlasc.converting.assembling import AxesAndClasses
-from carlasc.converting.protocol import Recording
-from carlasc.core.arrays import Float32Array, FloatArray, Uint32Array
+from carlasc.core.arrays import Float32Array, FloatArray, IntArray, Uint32Array
 from carlasc.core.boxes import Boxes
+from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import invert
 from carlasc.errors import ArgumentError, FormatError, first_names
 from carlasc.motion.box_table import BoxTable
@@ -39,8 +38,8 @@ class GivenBoxes:
     labels: Uint32Array
 
     @classmethod
-    def read(cls, path: AnyPath, target: AxesAndClasses) -> Self:
-        """Read a table, whose classes are those of the output.
+    def read(cls, path: AnyPath, classes: ClassTable) -> Self:
+        """Read a table with classes of a class table.
 
         Raises:
             MissingDataError: there is no such file.
@@ -48,42 +47,51 @@ class GivenBoxes:
         """
         table = BoxTable.read(path)
         try:
-            labels = [target.classes.id_of(name) for name in table.classes]
+            labels = [classes.id_of(name) for name in table.classes]
         except ArgumentError as error:
             raise FormatError(path, expected=error.expected, found=error.where) from error
         return cls(table, str(path), np.array(labels, np.uint32))
 
     def at_scans(
-        self, recording: Recording, times: FloatArray, first_T_scan: FloatArray
-    ) -> tuple[dict[int, Boxes], list[str]]:
+        self, numbers: Sequence[int], times: FloatArray, poses: FloatArray | None, drive: str
+    ) -> tuple[dict[int, Boxes], list[IntArray], list[str]]:
         """Return the boxes of each scan that has any, by frame number, in the frame of the scan;
-        and remarks, one line each. Tracks begin at 1.
+        their rows in the table, in the same order; and remarks, one line each.
+
+        Each box is moved by its velocity to the time of its scan. Tracks begin at 1.
 
         Args:
-            recording: the recording, with the frames that are converted.
-            times: (F,) seconds by frame number, by the recording's clock.
-            first_T_scan: (F, 4, 4) poses by frame number, right-handed.
+            numbers: the frame numbers of the F scans.
+            times: (F,) seconds since the first frame of the drive, increasing.
+            poses: (F, 4, 4) first_T_scan, right-handed; None if they are not estimated yet: then
+                times are checked, and no box is returned.
+            drive: the recording or the sequence, for errors.
 
         Raises:
             FormatError: the boxes are those of another drive.
         """
-        table, numbers = self.table, [handle.number for handle in recording.frames]
-        seconds, poses = (times - times[0])[numbers], first_T_scan[numbers]
-        index = table.frames_of(seconds, poses, self.where, recording.location)
-        late_s = seconds[index] - table.times
-        centers = table.values[:, :3] + np.nan_to_num(table.values[:, 7:10]) * late_s[:, None]
+        table = self.table
+        index = table.frames_of(times, poses, self.where, drive)
+        if poses is None:
+            return {}, [], []
+        late_s = times[index] - table.times
+        velocity = np.nan_to_num(table.values[:, 7:10])
+        centers = table.values[:, :3] + velocity * late_s[:, None]
         half = table.values[:, 6] / 2
         turns = np.column_stack([np.cos(half), half * 0, half * 0, np.sin(half)])
-        tracks = (table.numbers + max(1 - int(table.numbers.min()), 0)).astype(np.uint32)
+        more = max(1 - int(table.numbers.min()), 0)
+        tracks = (table.numbers + more).astype(np.uint32)
         columns = (tracks, self.labels, centers, turns, table.values[:, 3:6], tracks > 0)
         boxes = dict[int, Boxes]()
+        rows = list[IntArray]()
         for one in np.unique(index[index >= 0]).tolist():
+            rows.append(np.flatnonzero(index == one))
             own = Boxes(*(column[index == one] for column in columns))
             boxes[numbers[one]] = own.transform(invert(poses[one]))
         out = np.flatnonzero(index < 0)
         names = first_names(f"{table.numbers[row]} at {table.times[row]:g} s" for row in out)
         note = f"{len(out)} of {len(index)} boxes of {self.where} are at no scan, and are left out"
-        return boxes, [f"{note}: {names}"] if len(out) else []
+        return boxes, rows, [f"{note}: {names}"] if len(out) else []
 
     def check(self, boxes: Mapping[int, Boxes], scans: Mapping[int, Float32Array]) -> None:
         """Check that scans have points in the boxes near the sensor, or in the nearest one; both

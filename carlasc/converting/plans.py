@@ -153,17 +153,13 @@ class RecordingPlan(Examined):
         self.place_boxes()
 
     def place_boxes(self) -> None:
-        """Take the boxes of the given table, if there is one, under the poses, if these are known.
+        """Take the boxes of the given table, if there is one.
 
         Raises:
             FormatError: they are those of another drive.
         """
-        if self.given is not None and self.poses is not None:
-            self.boxes, notes = self.given.at_scans(self.recording, self.times, self.poses)
-            self.notes += notes
-            if not self.force:
-                frames = [one for one in self.recording.frames if one.number in self.boxes]
-                self.given.check(self.boxes, _some_scans(self.recording, frames))
+        if self.given is not None:
+            self.boxes = placed_boxes(self.given, self, force=self.force)
 
     @property
     def rig(self) -> Rig:
@@ -194,6 +190,32 @@ class RecordingPlan(Examined):
         return VehicleMotion(
             Trajectory(self.trajectory.world_T_vehicle[near], self.trajectory.seconds[near]), now
         )
+
+
+def placed_boxes(given: GivenBoxes, seen: Examined, *, force: bool) -> dict[int, Boxes]:
+    """Return the given boxes of each scan that has any, by frame number, in the frame of the scan;
+    none until poses are known. Remarks become notes.
+
+    Args:
+        given: the boxes.
+        seen: the recording, with its times, if it has any, and its poses, if they are known.
+        force: whether boxes without points are accepted.
+
+    Raises:
+        FormatError: they are those of another drive, by their times, places or points.
+    """
+    if seen.poses is None and not seen.has_times:
+        return {}
+    scans = seen.recording.frames
+    numbers = [handle.number for handle in scans]
+    poses = None if seen.poses is None else seen.poses[numbers]
+    seconds = (seen.times - seen.times[0])[numbers]
+    boxes, _, notes = given.at_scans(numbers, seconds, poses, seen.recording.location)
+    seen.notes += notes
+    if boxes and not force:
+        frames = [one for one in scans if one.number in boxes]
+        given.check(boxes, _some_scans(seen.recording, frames))
+    return boxes
 
 
 def choose_recordings(
@@ -448,7 +470,7 @@ def plan_recording(
         ConflictError: the output has another grid in the place of the voxels.
     """
     target = output.of(converter)
-    given = None if output.boxes is None else GivenBoxes.read(output.boxes, target)
+    given = None if output.boxes is None else GivenBoxes.read(output.boxes, target.classes)
     writer = sink.sequence(sequence_path(recording))
     grew = is_provisional(writer)
     known = options.force or (writer.read_document(layout.POSES) is not None and not grew)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from carlasc.converting.assembling import Assembled, LayoutOptions, Rig, read_scan
+from carlasc.converting.given_boxes import GivenBoxes
 from carlasc.converting.plans import (
     FILE,
     KISS_ICP,
@@ -17,13 +18,15 @@ from carlasc.converting.plans import (
     SplitName,
     choose_recordings,
     examine,
+    placed_boxes,
 )
 from carlasc.converting.plausibility import find_mount
 from carlasc.converting.protocol import Converter, Recording
 from carlasc.converting.registry import find_recordings, open_converter
 from carlasc.core.frames import FrameRange, Frames
-from carlasc.errors import CarlascError
+from carlasc.errors import CarlascError, only
 from carlasc.inspection.findings import Finding
+from carlasc.motion.box_table import ONE_FRAME
 from carlasc.motion.options import PoseOptions
 from carlasc.storage.files import AnyPath
 
@@ -87,23 +90,31 @@ def preview(
         sequences: names of sequences or the last parts of them; None for all.
         frames: numbers of the frames that would be converted; None for all.
         split: only sequences of this split.
-        layout: whether scans would be turned upright.
+        layout: whether scans would be turned upright, and the boxes that would be taken.
         poses: where poses would come from.
         options: options of the converter, by name.
 
     Raises:
         ArgumentError: an argument has a wrong value, or no converter has that name.
         MissingDataError: the source, a sequence or the poses do not exist.
-        FormatError: a file does not have the format.
+        FormatError: a file does not have the format, or boxes are those of another drive.
     """
     converter = open_converter(name, Path(source), options)
     recordings = choose_recordings(find_recordings(converter), Path(source), sequences, split)
     chosen = FrameRange.of(frames)
-    examined = (
-        examine(one, converter, poses, frames=chosen, level=layout.level, known=poses.force)
-        for one in recordings
-    )
-    return tuple(map(_preview, examined))
+    given = None
+    previews = []
+    if layout.boxes is not None:
+        only("boxes", {one.name: one for one in recordings}, ONE_FRAME)
+        given = GivenBoxes.read(layout.boxes, layout.of(converter).classes)
+    for recording in recordings:
+        seen = examine(
+            recording, converter, poses, frames=chosen, level=layout.level, known=poses.force
+        )
+        if given is not None and not any(one.severity == "error" for one in seen.findings):
+            placed_boxes(given, seen, force=poses.force)
+        previews.append(_preview(seen))
+    return tuple(previews)
 
 
 def _preview(seen: Examined) -> RecordingPreview:

@@ -9,12 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from carlasc.core.arrays import BoolArray, FloatArray
-from carlasc.core.boxes import mirror_boxes
-from carlasc.core.geometry import invert, mirror_poses, transform_points
+from carlasc.core.geometry import invert, transform_points
 from carlasc.errors import MissingDataError, check_types, import_extra, only
 from carlasc.metrics.confusion import json_number
 from carlasc.metrics.results import Cell, FigureTable
-from carlasc.motion import BoxTable, tracks_from_boxes
+from carlasc.motion import BoxTable, sequence_boxes, tracks_from_boxes, velocities_of
 from carlasc.storage import Source, as_source
 from carlasc.storage.files import AnyPath
 
@@ -138,12 +137,8 @@ def evaluate_boxes(
     if not having:
         raise MissingDataError(source, expected="annotated boxes, in the field boxes", found="none")
     sequence = only("truth", having, "one sequence with boxes")
-    numbers = sequence.frames("boxes")
-    times, frames = sequence.times_of(numbers), numbers.tolist()
-    poses = np.stack([sequence.read_pose(frame) for frame in frames])
-    boxes = {f: given for f in frames if (given := sequence.boxes(f)) is not None}
-    if sequence.metadata.axes == "left":
-        poses, boxes = mirror_poses(poses), {f: mirror_boxes(b) for f, b in boxes.items()}
+    frames = sequence.frames("boxes").tolist()
+    times, poses, boxes = sequence_boxes(sequence, frames)
     pose_of = dict(zip(frames, poses, strict=True))
     tracks = tracks_from_boxes(boxes, pose_of, dict(zip(frames, times.tolist(), strict=True)))
 
@@ -159,8 +154,7 @@ def evaluate_boxes(
             & (np.abs(np.arctan2(at[:, 1], at[:, 0])) <= fov_rad / 2)
             for at in (boxes[frame].centers, local)
         ]
-        speeds = {t.instance: v for t in tracks if (v := t.velocity_at(frame)) is not None}
-        velocity = np.array([speeds[number] for number in world.tracks.tolist()]).reshape(-1, 3)
+        velocity = velocities_of(tracks, frame, world)
         headings = np.arctan2(axes[:, 1], axes[:, 0])
         true = np.column_stack([world.centers[:, :2], world.sizes[:, :2], headings])
         turned = np.abs(headings[:, None] - values[:, 6] + np.pi) % (2 * np.pi) - np.pi

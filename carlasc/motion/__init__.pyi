@@ -5,7 +5,9 @@ from .bodies import usual_shell as usual_shell
 from .box_table import BOX_ENDINGS as BOX_ENDINGS
 from .box_table import BoxTable as BoxTable
 from .boxes import segment_by_boxes as segment_by_boxes
+from .boxes import sequence_boxes as sequence_boxes
 from .boxes import tracks_from_boxes as tracks_from_boxes
+from .boxes import velocities_of as velocities_of
 from .evidence import HORIZON_S as HORIZON_S
 from .evidence import EvidenceScan as EvidenceScan
 from .evidence import FreeSpaceEvidence as FreeSpaceEvidence

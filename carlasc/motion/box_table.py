@@ -161,13 +161,16 @@ class BoxTable:
             given = [{k: v for k, v in row.items() if v not in (None, "")} for row in rows]
             return cls._of([tuple((_DEFAULTS | row)[name] for name in _COLUMNS) for row in given])
 
-    def frames_of(self, times: FloatArray, poses: FloatArray, where: str, drive: str) -> IntArray:
+    def frames_of(
+        self, times: FloatArray, poses: FloatArray | None, where: str, drive: str
+    ) -> IntArray:
         """Return (R,) the index of the frame of each box: the nearest in time, -1 without one
         within 0.05 s. Of several boxes of an object, only the nearest in time is of a frame.
 
         Args:
             times: (F,) seconds of the frames, increasing.
-            poses: (F, 4, 4) world_T_sensor, in the frame of the table.
+            poses: (F, 4, 4) world_T_sensor, in the frame of the table; None if not known yet, so
+                that only times are checked.
             where: the file of the table, for errors.
             drive: the sequence, for errors.
 
@@ -179,7 +182,8 @@ class BoxTable:
         late = np.argsort(-apart, kind="stable").tolist()  # the nearest last, which is kept
         kept = np.array([*{(index[row], self.numbers[row]): row for row in late}.values()])
         kept = kept[apart[kept] <= _APART_S]
-        away = np.linalg.norm(self.values[kept, :3] - poses[index[kept], :3, 3], axis=1)
+        sensors = self.values[kept, :3] if poses is None else poses[index[kept], :3, 3]
+        away = np.linalg.norm(self.values[kept, :3] - sensors, axis=1)
         nearest = away.min(initial=np.inf)
         if nearest > _FARTHEST_M:
             far = f", the nearest {nearest:.0f} m away" if len(kept) else ""

@@ -15,10 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from carlasc.core.arrays import FloatArray, IntArray, LabelArray
-from carlasc.core.boxes import Boxes
+from carlasc.core.boxes import Boxes, mirror_boxes
 from carlasc.core.geometry import (
     Transform,
     invert,
+    mirror_poses,
     moved_back,
     multiply,
     rotation_z,
@@ -30,6 +31,7 @@ from carlasc.motion.paths import MIN_POINTS, Segment, best_observation, correcti
 from carlasc.motion.segments import MIN_SPEED_M_S
 from carlasc.motion.solving import nearest_rotation, resample, smooth
 from carlasc.motion.tracks import Track
+from carlasc.storage.protocol import Sequence as Series
 
 # fact: smooth-boxes
 _SMOOTH_S = 0.5  # half width of the window in which an object moves with constant acceleration
@@ -74,6 +76,34 @@ class _ObjectBoxes:
 
     def part(self, rows: IntArray) -> _ObjectBoxes:
         return _ObjectBoxes(*(values[rows] for values in vars(self).values()))
+
+
+def sequence_boxes(
+    sequence: Series, frames: Sequence[int]
+) -> tuple[FloatArray, FloatArray, dict[int, Boxes]]:
+    """Return (F,) seconds and (F, 4, 4) first_T_scan of frames of a sequence, and the boxes of
+    those that are annotated, in the frame of the scan; all right-handed.
+
+    Raises:
+        MissingDataError: there are no poses.
+        FormatError: a pose, a time or boxes are not valid.
+    """
+    poses = np.stack([sequence.read_pose(frame) for frame in frames])
+    boxes = {frame: own for frame in frames if (own := sequence.boxes(frame)) is not None}
+    if sequence.metadata.axes == "left":
+        poses = mirror_poses(poses)
+        boxes = {frame: mirror_boxes(own) for frame, own in boxes.items()}
+    return sequence.times_of(frames), poses, boxes
+
+
+def velocities_of(tracks: Sequence[Track], frame: int, boxes: Boxes) -> FloatArray:
+    """Return (N, 3) m/s, world: the velocity at a frame of the track of each of its boxes."""
+    own = {
+        track.instance: velocity
+        for track in tracks
+        if (velocity := track.velocity_at(frame)) is not None
+    }
+    return np.array([own[number] for number in boxes.tracks.tolist()]).reshape(-1, 3)
 
 
 def tracks_from_boxes(

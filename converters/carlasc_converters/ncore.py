@@ -145,6 +145,16 @@ class NcoreRecording(Recording):
         """(F, 2) microseconds of the frames of the first LiDAR."""
         return next(iter(self._spans.values()))
 
+    @property
+    def about(self) -> dict[str, Any]:
+        """Name, interval of time and version of the sequence, as each of its stores has them."""
+        return self._stores[0].attributes()
+
+    @property
+    def ends_us(self) -> IntArray:
+        """(F,) microseconds: the time of each frame."""
+        return self._first[:, 1]
+
     @cached_property
     def _slack_us(self) -> float:
         """Half of the time between frames: data farther from a frame do not belong to it."""
@@ -207,7 +217,8 @@ class NcoreRecording(Recording):
         return tree
 
     @cached_property
-    def _vehicle(self) -> str:
+    def vehicle(self) -> str:
+        """Name of the frame of the vehicle: the rig, or the first LiDAR."""
         first = next(iter(self._lidars))
         return _RIG if self._tree.connected(first, _RIG) else first
 
@@ -220,14 +231,14 @@ class NcoreRecording(Recording):
         """
         at, sensors = self._first[:1, 1] * _NS, []
         for name in self._lidars:
-            if not self._tree.connected(name, self._vehicle):
+            if not self._tree.connected(name, self.vehicle):
                 raise MissingDataError(
                     self.location,
-                    expected=f"poses from {name} to {self._vehicle}",
+                    expected=f"poses from {name} to {self.vehicle}",
                     found=self._tree,
                 )
             sensors.append(
-                Sensor(name, self._tree.lookup(self._vehicle, name, at)[0], deskewed=False)
+                Sensor(name, self._tree.lookup(self.vehicle, name, at)[0], deskewed=False)
             )
         return sensors
 
@@ -240,16 +251,16 @@ class NcoreRecording(Recording):
 
     def poses(self, *, force: bool = False) -> Trajectory | None:
         """Return the poses of the rig in the world; None if there are none."""
-        if not self._tree.connected(self._vehicle, _WORLD) or self._vehicle == _WORLD:
+        if not self._tree.connected(self.vehicle, _WORLD) or self.vehicle == _WORLD:
             return None
         tracks = [
-            track.values[0] for track in self._tree.edges(self._vehicle, _WORLD) if len(track) > 1
+            track.values[0] for track in self._tree.edges(self.vehicle, _WORLD) if len(track) > 1
         ]
         if not tracks:
             return None
         stamps = max(tracks, key=len)
         return Trajectory(
-            self._tree.lookup(_WORLD, self._vehicle, stamps),
+            self._tree.lookup(_WORLD, self.vehicle, stamps),
             self._seconds(stamps // _NS),
             self.location,
         )
@@ -319,13 +330,13 @@ class NcoreRecording(Recording):
         """Return the cameras with a model of the layout and with poses that lead to the vehicle."""
         models, at = [], self._first[:1, 1] * _NS
         for camera in self._cameras:
-            if camera.unknown is None and self._tree.connected(camera.name, self._vehicle):
+            if camera.unknown is None and self._tree.connected(camera.name, self.vehicle):
                 middles = self._seconds(camera.spans.mean(axis=1))
                 taken = [
                     np.nan if row is None else float(middles[row])
                     for row in self._images[camera.name]
                 ]
-                place = self._tree.lookup(self._vehicle, camera.name, at)[0]
+                place = self._tree.lookup(self.vehicle, camera.name, at)[0]
                 models.append(camera.model(place, np.array(taken) if len(middles) else None))
         return models
 
@@ -342,9 +353,9 @@ class NcoreRecording(Recording):
         """Return notes on what was left out of the recording, and on unknown classes of objects."""
         notes = [
             f"the camera {camera.name} was left out: "
-            f"{camera.unknown or f'no poses lead to {self._vehicle}'}"
+            f"{camera.unknown or f'no poses lead to {self.vehicle}'}"
             for camera in self._cameras
-            if camera.unknown or not self._tree.connected(camera.name, self._vehicle)
+            if camera.unknown or not self._tree.connected(camera.name, self.vehicle)
         ]
         for kind in ("poses", "cuboids", "intrinsics"):
             chosen, groups = self._component(kind), self._components[kind]
@@ -375,15 +386,15 @@ class NcoreRecording(Recording):
 
     def _between(self, reference: str, stamps: IntArray) -> Transform:
         """Return (4, 4) from a frame at the second time to the rig at the first time."""
-        if not self._tree.connected(reference, self._vehicle):
+        if not self._tree.connected(reference, self.vehicle):
             raise MissingDataError(
                 self.location,
-                expected=f"poses from {reference} to {self._vehicle}",
+                expected=f"poses from {reference} to {self.vehicle}",
                 found=self._tree,
             )
-        root = self._tree.ancestors(self._vehicle)[-1]
+        root = self._tree.ancestors(self.vehicle)[-1]
         now, then = (
-            self._tree.lookup(root, self._vehicle, stamps[:1])[0],
+            self._tree.lookup(root, self.vehicle, stamps[:1])[0],
             self._tree.lookup(root, reference, stamps[1:])[0],
         )
         return multiply(invert(now), then)

@@ -39,7 +39,9 @@ _MEMBERS = {
     "Obstacle": "barrier traffic_cone construction_cone construction_barrel",
     "Other object": "unknown protruding_object",
 }
-_BY_NAME = {name: _IDS[of] for of, names in _MEMBERS.items() for name in names.split()}
+_BY_NAME = {name.lower(): label for name, label in _IDS.items()} | {
+    name: _IDS[of] for of, names in _MEMBERS.items() for name in names.split()
+}
 OTHER_OBJECT = _IDS["Other object"]
 """The class of an object whose name is not known."""
 

@@ -12,6 +12,7 @@ import itertools
 import lzma
 import math
 import struct
+from collections.abc import Mapping
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -198,3 +199,13 @@ def _unpacked(data: bytes, where: Path) -> Any:
         check_ratio(len(text), packed, str(where))
         data = b""
     return import_extra("cbor2", "ncore").loads(text)
+
+
+def encode_store(groups: Mapping[str, Any]) -> bytes:
+    """Return the metadata of a store without arrays, from the attributes of each group by its name,
+    which ends in a slash, but for the root.
+    """
+    about = {f"{name}.zgroup": {"zarr_format": 2} for name in groups}
+    about |= {f"{name}.zattrs": attributes for name, attributes in groups.items()}
+    content = {"zarr_consolidated_format": 1, "metadata": about}
+    return lzma.compress(import_extra("cbor2", "ncore").dumps(content))

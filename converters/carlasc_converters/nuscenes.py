@@ -245,6 +245,11 @@ class NuScenesScene(Recording):
             models.append(camera)
         return models
 
+    def sample_tokens(self) -> dict[int, str]:
+        """Return the token of the sample of each key frame, by its number."""
+        tokens = self.tables.sample_tokens
+        return {n: tokens[scan.sample] for n, scan in enumerate(self._scans) if scan.sample >= 0}
+
     def boxes(self) -> Mapping[int, Boxes] | None:
         """Return the boxes of the key frames.
 

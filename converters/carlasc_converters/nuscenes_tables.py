@@ -185,6 +185,11 @@ class Tables:
         rows = read_rows(self.path("sample"), ("token", "scene_token"))
         return {token: (row, scene) for row, (token, scene) in enumerate(rows)}
 
+    @property
+    def sample_tokens(self) -> list[str]:
+        """The tokens of the samples, by row."""
+        return list(self._samples)
+
     @cached_property
     def mounts(self) -> dict[str, Transform]:
         """(4, 4) pose of each calibrated LiDAR in the frame of its vehicle, by token."""

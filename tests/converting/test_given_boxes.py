@@ -13,10 +13,11 @@ from typer.testing import CliRunner
 import carlasc
 from carlasc import FromScans, LayoutOptions, Run
 from carlasc.cli import app
+from carlasc.converting import preview
 from carlasc.core.boxes import mirror_boxes
 from carlasc.core.geometry import invert, mirror_poses, transform_points
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.motion import BoxTable, MotionOptions
+from carlasc.motion import BoxTable, MotionOptions, PoseOptions
 from carlasc.storage import FolderSource
 from carlasc.testing import KINDS, SimulatedDrive
 from carlasc.testing.drives import world_T_sensor
@@ -48,12 +49,14 @@ def drive(tmp_path_factory):
     return folder
 
 
-def convert(drive, out, boxes, **how):
+def given(drive, boxes):
     options = {"pose_file": str(drive / "poses.tum"), "time_file": str(drive / "times.txt")}
-    layout = LayoutOptions(boxes=boxes)
-    return carlasc.convert(
-        "scans", drive / "scans", out, layout=layout, options=options, grids=None, run=ONE, **how
-    )
+    return {"layout": LayoutOptions(boxes=boxes), "options": options}
+
+
+def convert(drive, out, boxes, **how):
+    how |= given(drive, boxes)
+    return carlasc.convert("scans", drive / "scans", out, grids=None, run=ONE, **how)
 
 
 def test_boxes_that_were_written_are_read_and_the_same_actors_are_found(drive, tmp_path):
@@ -154,6 +157,10 @@ def test_bad_boxes_are_refused_in_one_line_before_anything_is_written(drive, tmp
         assert str(error.value).startswith(str(file)) and "\n" not in str(error.value)
         assert found in error.value.found, name
         assert not (tmp_path / "out").exists()
+        if name in ("size", "away", "air"):  # the dry run says the same
+            with pytest.raises(FormatError) as same:
+                preview("scans", drive / "scans", **given(drive, file))
+            assert str(same.value) == str(error.value)
     with raises(ArgumentError, where="boxes", found=str(tmp_path / "boxes.txt")):
         convert(drive, tmp_path / "out", tmp_path / "boxes.txt")
     with raises(ArgumentError, where="boxes", found="a list of clips"):
@@ -165,6 +172,34 @@ def test_bad_boxes_are_refused_in_one_line_before_anything_is_written(drive, tmp
             run=Run(sequences_from=tmp_path / "clips.txt"),
             grids=None,
         )
+
+
+def test_boxes_of_other_times_are_refused_before_poses_are_estimated(drive, tmp_path, monkeypatch):
+    def stop(*given, **how):
+        raise AssertionError("poses are estimated")
+
+    monkeypatch.setattr("carlasc.motion.odometry.follow_scans", stop)
+    table, poses = BoxTable.read(drive / "boxes.csv"), PoseOptions("kiss-icp")
+    replace(table, times=table.times + 60).write(tmp_path / "late.csv")
+    with raises(FormatError, where="late.csv", expected="boxes at 0 to 0.9 s", found="60 to 60.9"):
+        convert(drive, tmp_path / "out", tmp_path / "late.csv", poses=poses)
+    with raises(FormatError, where="late.csv", found="60 to 60.9"):
+        preview("scans", drive / "scans", poses=poses, **given(drive, tmp_path / "late.csv"))
+    assert not (tmp_path / "out").exists()
+    preview("scans", drive / "scans", poses=poses, **given(drive, drive / "boxes.csv"))
+    with pytest.raises(AssertionError, match="poses are estimated"):
+        convert(drive, tmp_path / "out", drive / "boxes.csv", poses=poses)
+
+
+def test_a_dry_run_says_which_boxes_are_at_no_scan(drive, tmp_path):
+    table = BoxTable.read(drive / "boxes.csv")
+    times = table.times + np.where(np.arange(len(table.times)) == 3, 0.0501, 0.02)
+    replace(table, times=times).write(tmp_path / "boxes.csv")
+    command = ["convert", "scans", str(drive / "scans"), str(tmp_path / "out"), "--dry-run"]
+    command += ["--pose-file", str(drive / "poses.tum"), "--time-file", str(drive / "times.txt")]
+    done = CliRunner().invoke(app, [*command, "--boxes", str(tmp_path / "boxes.csv")])
+    assert done.exit_code == 0 and "1 of 10 boxes of" in done.stdout
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow

@@ -2,6 +2,8 @@
 the truth of a simulated drive.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from carlasc_converters.exporters import opensceneflow
@@ -14,6 +16,7 @@ from carlasc.core.geometry import (
     mirror_points,
     mirror_poses,
     rotate_vectors,
+    rotation_z,
     transform_points,
 )
 from carlasc.errors import FormatError, MissingDataError
@@ -53,8 +56,6 @@ def write_drive(
     for name, data in documents.items():
         if name not in leave_out:
             writer.write_document(name, data)
-    scan_T_vehicle = np.eye(4)
-    scan_T_vehicle[:3, 3] = -drive.sensors[0].vehicle_T_sensor[:3, 3]
     for frame in range(drive.frames):
         scan = drive.scan(frame)
         velocity = np.zeros((len(scan.instances), 3))
@@ -63,7 +64,7 @@ def write_drive(
             velocity[scan.instances == track] = rotate_vectors(
                 invert(world_T_sensor(drive, frame)), world[None]
             )[0]
-        boxes = drive.boxes(frame, CARLA).transform(scan_T_vehicle)
+        boxes = scan_boxes(drive, frame)
         boxes = boxes.select(
             np.array([(frame, track) not in drop for track in boxes.tracks.tolist()], bool)
         )
@@ -82,6 +83,13 @@ def write_drive(
             if name not in leave_out:
                 writer.write(name, frame, array)
     return root
+
+
+def scan_boxes(drive, frame):
+    """Return the boxes of a frame in the frame of its scan, right-handed."""
+    scan_T_vehicle = np.eye(4)
+    scan_T_vehicle[:3, 3] = -drive.sensors[0].vehicle_T_sensor[:3, 3]
+    return drive.boxes(frame, CARLA).transform(scan_T_vehicle)
 
 
 def renumber(boxes, more):
@@ -141,6 +149,37 @@ def test_flow_is_where_points_are_in_the_next_scan(tmp_path, axes, leave_out):
         still = scan.instances == 0
         own = transform_points(group["ego_motion"], group["lidar"]) - group["lidar"]
         assert np.abs(group["flow"][still] - own[still]).max() < 1e-4
+
+
+@pytest.mark.parametrize("leave_out", [("instances",), ("flow", "instances"), ("flow",)])
+def test_points_of_a_lidar_that_turns_move_with_the_box_of_their_own_time(tmp_path, leave_out):
+    drive = replace(DRIVE, rolling=True, columns=180)
+    write_drive(tmp_path / "in", leave_out=leave_out, drive=drive)
+    export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
+    log = read_log(tmp_path / "out" / "train" / "Street_1.h5")
+    late = 0
+    for frame, time in enumerate(TIMES[:-1]):
+        scan, expected = drive.scan(frame), true_flow(frame, drive)
+        inside = scan_boxes(drive, frame).contains(scan.deskewed[:, :3], 0.01).any(axis=0)
+        late += np.count_nonzero((scan.instances > 0) & ~inside)
+        assert np.abs(log[time]["flow"] - expected).max() < 1e-4
+    assert late > 10  # they are in no box of the time of the scan
+
+
+def test_points_of_a_thing_that_turns_turn_with_it(tmp_path):
+    thing = Boxes.from_poses(
+        np.array([1]), np.array([10]), np.eye(4)[None], np.array([[4.0, 2.0, 1.5]])
+    )
+    turned = rotation_z(0.1)
+    turned[0, 3] = 1.0
+    later = Boxes.from_poses(thing.tracks, thing.labels, turned[None], thing.sizes)
+    step = opensceneflow._Step(np.eye(4), 0.1)
+    seconds = np.array([-0.05, 0.0, 0.05])
+    points = (np.array([[1.9, 0, 0]] * 3) + seconds[:, None] * [10, 0, 0]).astype(np.float32)
+    flow = step.flow(points, seconds, None, None, thing, later)["flow"]
+    # 10 m/s, along the new heading after the step
+    expected = turned[:2, 0] * (1.9 + 10 * seconds)[:, None] + [1, 0] - points[:, :2]
+    assert np.abs(flow[:, :2] - expected).max() < 1e-5
 
 
 def test_a_scan_has_the_types_of_the_format(tmp_path):

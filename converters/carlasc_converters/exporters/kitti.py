@@ -21,8 +21,9 @@ from carlasc.core.arrays import (
     LabelArray,
     Uint32Array,
 )
+from carlasc.core.cameras import CameraModel
 from carlasc.core.classes import ClassTable
-from carlasc.core.geometry import invert, mirror_poses, multiply
+from carlasc.core.geometry import Transform, invert, mirror_poses, multiply
 from carlasc.core.grids import mirror_grid, mirror_spec
 from carlasc.core.tables import CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_choice
@@ -195,14 +196,10 @@ class KittiExporter(FrameExporter):
         documents = {}
         if layout.POSES in sequence.documents():
             poses = sequence.poses if _is_right_handed(sequence) else mirror_poses(sequence.poses)
-            calibration = _calibration(sequence)
-            if "image_0" in storage.cameras_of(sequence):
-                poses = multiply(calibration["Tr"], poses, invert(calibration["Tr"]))
+            calibration = calibration_of(sequence)
+            poses = multiply(calibration["Tr"], poses, invert(calibration["Tr"]))
             documents["poses.txt"] = layout.encode_poses(poses)
-            documents["calib.txt"] = "".join(
-                f"{name}: {' '.join(f'{value:.12e}' for value in matrix[:3].ravel())}\n"
-                for name, matrix in calibration.items()
-            ).encode()
+            documents["calib.txt"] = encode_calibration(calibration)
         if layout.TIMES in sequence.documents():
             documents["times.txt"] = layout.encode_times(sequence.times)
         return documents
@@ -371,23 +368,43 @@ def _kept_files(sequence: storage.Sequence, frame: int) -> dict[str, bytes]:
     return kept
 
 
-def _calibration(sequence: storage.Sequence) -> dict[str, FloatArray]:
-    """Return the projections P0 to P3 and Tr, from the LiDAR to the left camera, of the rectified
-    cameras image_0 to image_3; identities without them.
+def cameras_by_number(sequence: storage.Sequence) -> dict[int, CameraModel]:
+    """Return KITTI's rectified cameras of a sequence, image_0 to image_3 or image_00 to image_03,
+    by their numbers; none without the first one, to which the others are related.
     """
-    cameras = storage.cameras_of(sequence)
-    left = cameras.get("image_0")
+    names = {name: n for n in range(4) for name in (f"image_{n}", f"image_0{n}")}
+    cameras = storage.cameras_of(sequence).items()
+    found = {names[name]: camera for name, camera in cameras if name in names}
+    return found if 0 in found else {}
+
+
+def calibration_of(
+    sequence: storage.Sequence, camera_T_lidar: Transform | None = None
+) -> dict[str, FloatArray]:
+    """Return the projections P0 to P3 and Tr, from the LiDAR to the left camera, of the rectified
+    cameras; identities without them, or the given Tr.
+    """
+    cameras = cameras_by_number(sequence)
     lidar_T_scan = np.diag([1.0, 1.0 if _is_right_handed(sequence) else -1.0, 1.0, 1.0])
-    camera_T_lidar = np.eye(4)
-    if left is not None:
-        camera_T_lidar = invert(lidar_T_scan @ left.sensor_T_camera)
+    left_T_lidar = np.eye(4) if camera_T_lidar is None else camera_T_lidar
+    if cameras:
+        left_T_lidar = invert(lidar_T_scan @ cameras[0].sensor_T_camera)
     made: dict[str, FloatArray] = {}
     for number, name in enumerate(_PROJECTIONS):
-        camera, made[name] = cameras.get(f"image_{number}"), np.eye(4)
-        if camera is not None and left is not None:
-            left_T_camera = camera_T_lidar @ lidar_T_scan @ camera.sensor_T_camera
-            made[name] = camera.matrix @ invert(left_T_camera)[:3]
-    return {**made, "Tr": camera_T_lidar}
+        made[name] = np.eye(4)
+        if number in cameras:
+            left_T_camera = left_T_lidar @ lidar_T_scan @ cameras[number].sensor_T_camera
+            matrix, moved = cameras[number].matrix, invert(left_T_camera)[:3, 3]
+            made[name] = np.column_stack([matrix, matrix @ moved])  # rectified: axes are the same
+    return {**made, "Tr": left_T_lidar}
+
+
+def encode_calibration(matrices: Mapping[str, FloatArray]) -> bytes:
+    """Return the bytes of a file of calibrations: name and three rows of each matrix per line."""
+    return "".join(
+        f"{name}: {' '.join(f'{value:.12e}' for value in matrix[:3].ravel())}\n"
+        for name, matrix in matrices.items()
+    ).encode()
 
 
 def _is_right_handed(sequence: storage.Sequence) -> bool:

@@ -18,9 +18,17 @@ from numpy.typing import NDArray
 
 from carlasc import storage
 from carlasc.converting import Exported, Files, SequenceExporter, SequenceFile
-from carlasc.core.arrays import AnyArray, Float32Array, LabelArray, Uint32Array
+from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, LabelArray, Uint32Array
 from carlasc.core.boxes import Boxes, mirror_boxes
-from carlasc.core.geometry import Transform, invert, mirror_points, mirror_poses, transform_points
+from carlasc.core.geometry import (
+    Transform,
+    invert,
+    mirror_points,
+    mirror_poses,
+    moved_back,
+    rotate_vectors,
+    transform_points,
+)
 from carlasc.core.tables import SEMANTICKITTI, lines_of
 from carlasc.errors import FormatError, MissingDataError, import_extra
 from carlasc.motion import ground_points
@@ -31,6 +39,7 @@ from carlasc_converters.exporters.classes import classes_of, lookup_of, mapping_
 _EVALUATED = 5  # every fifth scan with flow is evaluated, as in the project's own script
 # points within this distance along x and y are evaluated, as in the challenge of Argoverse 2
 _EVALUATED_M = 50.0
+_SURFACE_M = 0.01  # points on the surface of a box count as inside, in spite of rounding
 _FIRST_NS = (
     10**18
     # name of the first scan's group: the loader orders names as text, so all need the same number
@@ -199,7 +208,8 @@ class OpenSceneFlowExporter(SequenceExporter):
             now, later = (_boxes(sequence, number) for number in (frame, following))
             (elapsed_s,) = np.diff(sequence.times_of([frame, following])).tolist()
             step = _Step(invert(_pose(sequence, following)) @ pose, elapsed_s)
-            made |= step.flow(points, velocity, read.get("instances"), now, later)
+            seconds, instances = read.get("seconds"), read.get("instances")
+            made |= step.flow(points, seconds, velocity, instances, now, later)
             near = (np.abs(points[:, :2]) <= _EVALUATED_M).all(axis=1)
             made["eval_mask"] = near & ~made["ground_mask"] & made["flow_is_valid"]
         return made
@@ -233,6 +243,7 @@ class _Step:
     def flow(
         self,
         points: Float32Array,
+        seconds: AnyArray | None,
         velocity: Float32Array | None,
         instances: LabelArray | None,
         now: Boxes | None,
@@ -242,8 +253,10 @@ class _Step:
         which it is known.
 
         An object with boxes in both scans moves with its box; without a box in the next scan, its
-        points are not valid. Other points move by their velocity. Without velocities, points
-        outside of boxes are static, and scans without annotation have no valid points.
+        points are not valid. A point that was seen some seconds after the time of its scan was seen
+        on the box of that moment, and so it is in the next scan. Other points move by their
+        velocity, which is that at their own time. Without velocities, points outside of boxes are
+        static, and scans without annotation have no valid points.
         """
         moved = (
             points.astype(np.float64)
@@ -255,20 +268,35 @@ class _Step:
             len(points), velocity is not None or (now is not None and later is not None)
         )
         if now is not None and later is not None:
-            owners = _owners(now, points) if instances is None else instances
             rows = {int(track): row for row, track in enumerate(later.tracks)}
-            for track, now_T_box in zip(now.tracks.tolist(), now.sensor_T_box, strict=True):
+            speeds = self._speeds(now, later, rows)
+            owners = _owners(now, points, seconds, speeds) if instances is None else instances
+            for row, track in enumerate(now.tracks.tolist()):
                 of_it = owners == track
                 if track not in rows:
                     valid[of_it] = False
                 elif of_it.any():
-                    next_T_box = later.sensor_T_box[rows[track]]
-                    there[of_it] = transform_points(next_T_box @ invert(now_T_box), points[of_it])
+                    change = later.sensor_T_box[rows[track]] @ invert(now.sensor_T_box[row])
+                    late = None if seconds is None else seconds[of_it]
+                    own = moved_back(points[of_it].astype(np.float64), late, speeds[row])
+                    ahead = -rotate_vectors(change, speeds[row])
+                    there[of_it] = moved_back(transform_points(change, own), late, ahead)
         return {
             "flow": (there - points).astype(np.float32),
             "flow_is_valid": valid,
             "ego_motion": self.next_T_now,
         }
+
+    def _speeds(self, now: Boxes, later: Boxes, rows: Mapping[int, int]) -> FloatArray:
+        """Return (N, 3) m/s of each box to its box in a row of the next scan, in the frame of this
+        scan; 0 without one.
+        """
+        centers = transform_points(invert(self.next_T_now), later.centers)
+        speeds = np.zeros((len(now), 3))
+        for row, track in enumerate(now.tracks.tolist()):
+            if track in rows:
+                speeds[row] = (centers[rows[track]] - now.centers[row]) / self.seconds
+        return speeds
 
 
 class _LogFile(SequenceFile):
@@ -314,10 +342,24 @@ class _LogFile(SequenceFile):
         ]
 
 
-def _owners(boxes: Boxes, points: Float32Array) -> Uint32Array:
-    """Return (N,) the track of the box that each point is in, 0 for none."""
-    rows = boxes.owners(points)
-    return np.append(boxes.tracks, np.uint32(0))[rows]
+def _owners(
+    boxes: Boxes, points: Float32Array, seconds: AnyArray | None, speeds: FloatArray
+) -> Uint32Array:
+    """Return (N,) the track of the box that each point was in when it was seen, 0 for none: of
+    several, the smallest.
+
+    Args:
+        boxes: the boxes of the scan.
+        points: (N, 3).
+        seconds: (N,) seconds after the time of the scan; None for 0.
+        speeds: (B, 3) velocity of each box, m/s, frame of the scan.
+    """
+    owners = np.zeros(len(points), np.uint32)
+    for row in np.argsort(-np.prod(boxes.sizes, axis=1), kind="stable").tolist():
+        own = boxes.select(np.array([row]))
+        inside = own.contains(moved_back(points, seconds, speeds[row]), _SURFACE_M)[0]
+        owners[inside] = boxes.tracks[row]
+    return owners
 
 
 def _scans_in(path: Path) -> dict[str, bool]:
