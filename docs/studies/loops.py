@@ -34,6 +34,7 @@ DRIVES = (
     ("other way", 62, 64, 4),
     ("many blocks", 62, 32, 2),
     ("there and back", 62, 16, 1),
+    ("there and back", 51, 16, 1),
 )
 """Route, seed, channels, and every which channel is used."""
 _RAYS = 1000  # per channel
