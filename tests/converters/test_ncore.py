@@ -13,9 +13,10 @@ from carlasc_converters.ncore import Ncore
 from carlasc_converters.ncore_classes import NCORE, NCORE_TO_CARLA, OTHER_OBJECT, class_of_name
 from helpers.converters.ncore_files import NAMES, START_US, contents, for_library, write_store
 
-from carlasc.converting import Sensor
+from carlasc.converting import Sensor, convert, export
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.errors import FormatError, MissingDataError
+from carlasc.running import Run
 from carlasc.storage.camera_files import encode_image
 from carlasc.testing import ConverterContract, SimulatedDrive
 
@@ -325,3 +326,36 @@ def test_a_camera_without_numbers_is_one_line(tmp_path):
     (recording,) = Ncore(tmp_path).sequences()
     with pytest.raises(FormatError, match="intrinsics of front: .*camera of NCore"):
         recording.cameras()
+
+
+READS_CUBOIDS = """
+import sys
+from ncore.data.v4 import SequenceComponentGroupsReader, SequenceLoaderV4
+from upath import UPath
+reader = SequenceComponentGroupsReader([UPath(path) for path in sys.argv[1:]])
+for name in ("default", "carlasc"):
+    loader = SequenceLoaderV4(reader, cuboids_component_group_name=name)
+    for one in loader.get_cuboid_track_observations():
+        print(name, one.timestamp_us, *one.bbox3.centroid, *one.bbox3.dim, *one.bbox3.rot)
+"""
+
+
+@pytest.mark.slow
+def test_the_library_reads_exported_cuboids_beside_the_recording(tmp_path, library):
+    own, seq = write_store(tmp_path, SimulatedDrive(4)), tmp_path / "seq"
+    convert("ncore", own, seq, grids=None, run=Run(workers=1))
+    export("ncore", seq, tmp_path, options={"recording": str(own)}, run=Run(workers=1))
+    (more,) = tmp_path.glob("*.zarr")
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    command = [library, "-c", READS_CUBOIDS, str(own), str(more)]
+    done = subprocess.run(
+        command, check=False, capture_output=True, text=True, timeout=300, env=environment
+    )
+    assert done.returncode == 0, done.stderr
+    rows = [line.split() for line in done.stdout.splitlines()]
+    found, given = (
+        np.array(sorted([float(value) for value in row[1:]] for row in rows if row[0] == name))
+        for name in ("carlasc", "default")
+    )
+    assert len(found) > 4
+    np.testing.assert_allclose(found, given, rtol=0, atol=1e-6)

@@ -132,7 +132,7 @@ def test_places_in_the_image_are_those_of_the_corners(tracking, tmp_path):
     assert seen > 3
 
 
-@pytest.mark.parametrize("axes", ["left", "right"])
+@pytest.mark.parametrize("axes", ["left", pytest.param("right", marks=pytest.mark.slow)])
 def test_without_cameras_boxes_are_seen_from_the_lidar(tmp_path, axes):
     write_drive(tmp_path / "in", axes=axes)
     result = export("kitti-tracking", tmp_path / "in", tmp_path / "out", run=ONE)
@@ -197,38 +197,31 @@ def check_results(data):
     return data["results"]
 
 
-def test_nuscenes_comes_back_with_its_tokens_in_its_frame(tmp_path):
+@pytest.mark.parametrize("classes", ["nuscenes", pytest.param("carla", marks=pytest.mark.slow)])
+def test_nuscenes_comes_back_with_its_tokens_in_its_frame(tmp_path, classes):
     drives = {"scene-0061": nusc.drive(4), "scene-0103": nusc.drive()}
     nusc.write_nuscenes(tmp_path / "in", drives)
-    for classes in ("nuscenes", "carla"):
-        layout, out = LayoutOptions(classes=classes), tmp_path / classes
-        convert("nuscenes", tmp_path / "in", out / "seq", layout=layout, grids=None, run=ONE)
-        options = {"tables": str(tmp_path / "in")}
-        export("nuscenes", out / "seq", out, options=options, run=ONE)
-    tables = tmp_path / "in/v1.0-mini"
-    samples = json.loads((tables / "sample.json").read_bytes())
-    annotations = json.loads((tables / "sample_annotation.json").read_bytes())
-    scenes = {row["token"]: row["name"] for row in json.loads((tables / "scene.json").read_bytes())}
-    for classes in ("nuscenes", "carla"):
-        results = {
-            split: check_results(json.loads((tmp_path / classes / f"{split}.json").read_bytes()))
-            for split in ("train", "val")
-        }
-        for split, scene in (("train", "scene-0061"), ("val", "scene-0103")):
-            wanted = {row["token"] for row in samples if scenes[row["scene_token"]] == scene}
-            assert set(results[split]) == wanted
-        every = {**results["train"], **results["val"]}
-        assert sum(map(len, every.values())) == len(annotations)
-        for row in annotations:
-            away = [
-                np.abs(np.subtract(box["translation"], row["translation"])).max()
-                for box in every[row["sample_token"]]
-            ]
-            box = every[row["sample_token"]][int(np.argmin(away))]
-            assert min(away) < 1e-5
-            assert box["size"] == pytest.approx(row["size"], abs=1e-6)
-            turned = np.abs(np.dot(box["rotation"], row["rotation"]))
-            assert turned == pytest.approx(1, abs=1e-9)
+    layout, out = LayoutOptions(classes=classes), tmp_path / "out"
+    convert("nuscenes", tmp_path / "in", tmp_path / "seq", layout=layout, grids=None, run=ONE)
+    export("nuscenes", tmp_path / "seq", out, options={"tables": str(tmp_path / "in")}, run=ONE)
+    samples, annotations, scenes = (
+        json.loads((tmp_path / f"in/v1.0-mini/{name}.json").read_bytes())
+        for name in ("sample", "sample_annotation", "scene")
+    )
+    names, every = {row["token"]: row["name"] for row in scenes}, {}
+    for split, scene in (("train", "scene-0061"), ("val", "scene-0103")):
+        results = check_results(json.loads((out / f"{split}.json").read_bytes()))
+        wanted = {row["token"] for row in samples if names[row["scene_token"]] == scene}
+        assert set(results) == wanted
+        every |= results
+    assert sum(map(len, every.values())) == len(annotations)
+    for row in annotations:
+        boxes = every[row["sample_token"]]
+        away = [np.abs(np.subtract(b["translation"], row["translation"])).max() for b in boxes]
+        box = boxes[int(np.argmin(away))]
+        assert min(away) < 1e-5
+        assert box["size"] == pytest.approx(row["size"], abs=1e-6)
+        assert np.abs(np.dot(box["rotation"], row["rotation"])) == pytest.approx(1, abs=1e-9)
 
 
 def test_other_drives_have_tokens_of_their_own_and_velocities(tmp_path):
@@ -250,7 +243,7 @@ def test_other_drives_have_tokens_of_their_own_and_velocities(tmp_path):
 
 
 @pytest.mark.needs("cbor2", "numcodecs")
-@pytest.mark.parametrize("level", [False, True])
+@pytest.mark.parametrize("level", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_ncore_gets_a_store_with_the_observations_of_the_recording(tmp_path, level):
     drive = SimulatedDrive(4)
     (tmp_path / "in").mkdir()
@@ -320,6 +313,7 @@ def test_what_cannot_be_exported_is_one_line(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_scans_of_other_times_are_refused(tmp_path):
     nusc.write_nuscenes(tmp_path / "in", {"scene-0103": nusc.drive()})
     convert("nuscenes", tmp_path / "in", tmp_path / "seq", grids=None, run=ONE)

@@ -268,15 +268,16 @@ class _Step:
             len(points), velocity is not None or (now is not None and later is not None)
         )
         if now is not None and later is not None:
-            rows = {int(track): row for row, track in enumerate(later.tracks)}
-            speeds = self._speeds(now, later, rows)
+            _, rows, next_rows = np.intersect1d(now.tracks, later.tracks, return_indices=True)
+            speeds, centers = np.zeros((len(now), 3)), later.centers[next_rows]
+            here = transform_points(invert(self.next_T_now), centers)
+            speeds[rows] = (here - now.centers[rows]) / self.seconds
             owners = _owners(now, points, seconds, speeds) if instances is None else instances
-            for row, track in enumerate(now.tracks.tolist()):
-                of_it = owners == track
-                if track not in rows:
-                    valid[of_it] = False
-                elif of_it.any():
-                    change = later.sensor_T_box[rows[track]] @ invert(now.sensor_T_box[row])
+            valid[np.isin(owners, np.setdiff1d(now.tracks, later.tracks))] = False
+            changes = later.sensor_T_box[next_rows] @ invert(now.sensor_T_box[rows])
+            for row, change in zip(rows.tolist(), changes, strict=True):
+                of_it = owners == now.tracks[row]
+                if of_it.any():
                     late = None if seconds is None else seconds[of_it]
                     own = moved_back(points[of_it].astype(np.float64), late, speeds[row])
                     ahead = -rotate_vectors(change, speeds[row])
@@ -286,17 +287,6 @@ class _Step:
             "flow_is_valid": valid,
             "ego_motion": self.next_T_now,
         }
-
-    def _speeds(self, now: Boxes, later: Boxes, rows: Mapping[int, int]) -> FloatArray:
-        """Return (N, 3) m/s of each box to its box in a row of the next scan, in the frame of this
-        scan; 0 without one.
-        """
-        centers = transform_points(invert(self.next_T_now), later.centers)
-        speeds = np.zeros((len(now), 3))
-        for row, track in enumerate(now.tracks.tolist()):
-            if track in rows:
-                speeds[row] = (centers[rows[track]] - now.centers[row]) / self.seconds
-        return speeds
 
 
 class _LogFile(SequenceFile):
