@@ -9,10 +9,12 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, cast
+from uuid import uuid4
 
 import numpy as np
 
@@ -48,19 +50,19 @@ from carlasc.errors import (
     count,
     only,
 )
-from carlasc.groundtruth.inputs import GridPlan, without_caches
+from carlasc.groundtruth.inputs import GridPlan
 from carlasc.groundtruth.options import FromScans, GridOptions, Voting
-from carlasc.groundtruth.provisional import ProvisionalFrame
+from carlasc.groundtruth.provisional import MadeGrids, NewScans
 from carlasc.inspection.pose_quality import describe_jumps
 from carlasc.motion import odometry
 from carlasc.motion.options import PoseOptions
-from carlasc.running.processes import one_pool
+from carlasc.running.processes import own_processes
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout as files
 from carlasc.storage.files import AnyPath
 from carlasc.storage.folder import FolderSink
 from carlasc.storage.inputs import PROVISIONAL, MadeFrom
-from carlasc.storage.layout import Metadata, place_of
+from carlasc.storage.layout import Metadata
 from carlasc.storage.opening import as_sink
 from carlasc.storage.protocol import Sink, Source
 
@@ -68,6 +70,7 @@ _LOOK_S = 0.5  # between two looks at the folder
 _BATCH = 10  # scans that are written together, at most
 _PAUSE_S = 3.0  # a pause of the sensor that is noted
 _SAID_S = 10.0  # between two lines on the progress
+_CALLS = 2  # of a maker that wait for its result
 _AROUND = 20  # poses that give the motion during a scan
 
 
@@ -123,13 +126,11 @@ def follow(
     poses, layout = replace(poses, source="kiss-icp"), replace(layout, boxes=None)
     converter = open_converter(name, root, options)
     look = _Folder(converter, idle_s, say, wait)
-    spread = Run(max(2, run.processes))  # one process makes grids, even on one core
-    with one_pool(spread) as pool:
-        makers = cast(Executor, pool.executor)
+    with ExitStack() as pools:
+        # one process makes grids, even on one core; each keeps what it knows of the drive
+        makers = [pools.enter_context(own_processes(1)) for _ in range(max(run.processes - 1, 1))]
         documents = describe(converter, name, layout)
-        drive = _Drive(
-            look, converter, sink, layout, documents, poses, grids, makers, spread.processes - 1
-        )
+        drive = _Drive(look, converter, sink, layout, documents, poses, grids, makers)
         try:
             drive.run()
         except KeyboardInterrupt:
@@ -203,8 +204,7 @@ class _Drive:
         metadata: the entries of carlasc.json that do not depend on scans.
         poses: how poses are estimated.
         grids: the grids; None makes none.
-        pool: processes that make grids.
-        makers: number of grids that are made at the same time.
+        makers: a process each, which makes grids.
         arrived: time of the file of each scan, by frame number.
         lines: pose of each scan, first_T_scan, as far as they are estimated.
     """
@@ -216,16 +216,16 @@ class _Drive:
     metadata: Metadata
     poses: PoseOptions
     grids: GridOptions | None
-    pool: Executor
-    makers: int
+    makers: list[Executor]
     arrived: list[float] = field(default_factory=list)
     lines: list[Transform] = field(default_factory=list)
     _waiting: dict[int, tuple[FrameHandle, Assembled]] = field(default_factory=dict)
     _written: int = 0
     _grid: GridPlan | None = None
-    _making: dict[int, Future[str | None]] = field(default_factory=dict)
+    _making: dict[int, list[Future[MadeGrids]]] = field(default_factory=dict)
     _made: list[int] = field(default_factory=list)
-    _next: int = 0
+    _told: dict[int, int] = field(default_factory=dict)
+    _key: str = field(default_factory=lambda: uuid4().hex)
     _said: float = 0.0
 
     def run(self) -> None:
@@ -330,24 +330,37 @@ class _Drive:
         return VehicleMotion(Trajectory(vehicle, times), float(self.plan.times[number]))
 
     def _make_grids(self, grids: GridOptions) -> None:
-        """Take grids that are made, and begin that of the newest frame with a whole window."""
-        observe = grids.observe if isinstance(grids.observe, FromScans) else FromScans()
-        for number in [number for number, making in self._making.items() if making.done()]:
-            if error := self._making.pop(number).result():
-                self.folder.say(f"no grid of frame {number} yet: {error}")
-            else:
-                self._made.append(number)
-                self._report(number + observe.window[1])
-        number = self._written - 1 - observe.window[1]
-        if number < self._next or len(self._making) >= self.makers:
-            return
-        path, source = sequence_path(self.plan.recording), self.sink.source()
-        sequence = source.sequences_in([place_of(path)])[path]
+        """Take grids that are made, and tell the makers of new scans; each has one call to wait
+        for, and one more to go on with.
+        """
         if self._grid is None:
-            self._grid = self._plan(grids, source)
-        self._next = number + 1
-        frame = ProvisionalFrame(without_caches(sequence), self.plan.writer, self._grid, number)
-        self._making[number] = self.pool.submit(ProvisionalFrame.make, frame)
+            self._grid = self._plan(grids, self.sink.source())
+        path, known = sequence_path(self.plan.recording), self._written
+        for index, maker in enumerate(self.makers):
+            making, told = self._making.setdefault(index, []), self._told.get(index, 0)
+            while making and making[0].done():
+                self._take(making.pop(0).result())
+            if known > told and len(making) < _CALLS:
+                self._told[index] = known
+                new = NewScans(
+                    f"{self._key}-{index}",
+                    self.sink,
+                    path,
+                    self.plan.writer,
+                    self._grid,
+                    known,
+                    (index, len(self.makers)),
+                )
+                making.append(maker.submit(NewScans.make, new))
+
+    def _take(self, made: MadeGrids) -> None:
+        """Note what a maker made."""
+        for problem in made.problems:
+            self.folder.say(problem)
+        self._made += made.numbers
+        if made.numbers and self._grid is not None:
+            observe = cast(FromScans, self._grid.observe)
+            self._report(made.numbers[-1] + observe.window[1])
 
     def _plan(self, grids: GridOptions, source: Source) -> GridPlan:
         """Return the plan of the grids, by the ground and the reach of the scans so far."""
@@ -385,8 +398,9 @@ class _Drive:
     def finish(self) -> None:
         """Wait for the grids that are being made, and say what there is."""
         for making in self._making.values():
-            making.exception()
-        made = len(self._made) + len(self._making)
+            for grids in making:
+                self._take(grids.result())
+        made = len(self._made)
         self.folder.say(
             f"the drive has {count(len(self.arrived), 'scan')}; "
             f"{count(made, 'provisional grid')} were made"

@@ -2,78 +2,227 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import time
+from dataclasses import dataclass, field, replace
 from typing import cast
 
+import numpy as np
+
 from carlasc.errors import CarlascError
-from carlasc.groundtruth.from_scans.feed import WithoutScans
-from carlasc.groundtruth.from_scans.sequences import ScanSequence
+from carlasc.groundtruth.from_scans.actor_voxels import with_numbers
+from carlasc.groundtruth.from_scans.feed import ScanFeed
+from carlasc.groundtruth.from_scans.motion_pass import track_of, untracked
+from carlasc.groundtruth.from_scans.sequences import ScanFrame, ScanSequence, ScanWindow
 from carlasc.groundtruth.inputs import GridPlan
 from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.run import FrameTask, settings_of
-from carlasc.running.spreading import Run
+from carlasc.motion import ActorFollower, Track, complete_bodies
+from carlasc.motion.evidence import EvidenceWindow
+from carlasc.motion.found_actors import FoundActor
+from carlasc.motion.tracks import FIRST_FOUND, MovingActors
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
 from carlasc.storage.inputs import PROVISIONAL, MadeFrom
-from carlasc.storage.protocol import Sequence, SequenceWriter
+from carlasc.storage.layout import place_of
+from carlasc.storage.protocol import Sequence, SequenceWriter, Sink
 from carlasc.storage.resuming import check_grid
 
-_EVERY = 3  # of the scans of a window, every N-th one is merged: to find what moves takes time
+_AFTER_S = 0.8  # scans up to so much later show what moves in a scan
+_AGAIN_S = 1.0  # tracks are estimated again after so much of the drive
+_KEPT_S = 10.0  # how long observations of actors are kept
+_BEHIND = 15  # with so many scans more that wait, every second one is used, and so on
+
+
+@dataclass
+class MadeGrids:
+    """What a call of `NewScans.make` made.
+
+    Attributes:
+        numbers: the frames that got a grid.
+        problems: scans and frames that failed, and why.
+    """
+
+    numbers: list[int] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
-class ProvisionalFrame:
-    """A frame of which the whole window exists. It is made in a worker.
+class NewScans:
+    """Scans that were written since the last call, for a process that makes provisional grids.
 
-    Every third scan of its window is merged, and shows what moves; poses are not refined. So each
-    grid takes the same short time, however long the drive is.
+    The process keeps what it knows of the drive from call to call, so each scan is read and
+    searched for motion once, and each ray is followed once. Poses are not refined.
 
     Attributes:
-        sequence: its sequence.
+        key: of the drive and its process.
+        sink: the output.
+        path: path of the sequence.
         writer: writes beside it.
         plan: the plan of the final grids.
-        number: number of the frame.
+        known: number of frames whose poses are written.
+        part: which of so many processes this one is: it makes the grids of every so many-th frame.
     """
 
-    sequence: Sequence
+    key: str
+    sink: Sink
+    path: str
     writer: SequenceWriter
     plan: GridPlan
-    number: int
+    known: int
+    part: tuple[int, int] = (0, 1)
 
-    def make(self) -> str | None:
-        """Make and write the grid of the frame, marked as provisional; return why it failed.
+    def make(self) -> MadeGrids:
+        """Take the scans, and make grids, marked as provisional, as long as this takes less time
+        than the sensor took; at least that of the newest frame whose window is complete.
 
         Raises:
-            StorageError: the grid cannot be written.
+            StorageError: a grid cannot be written.
         """
-        observe = cast(FromScans, self.plan.observe)
-        first, last = observe.window
-        every = observe.stride if observe.stride > 1 else _EVERY
-        others = set(self.sequence.frames("points").tolist())
-        others -= {self.number + i for i in range(first, last + 1) if i % every == 0}
-        near, plan, writer = WithoutScans(self.sequence, others), self.plan, self.writer
-        try:
-            params = settings_of(ScanSequence(near, plan, observe), plan)
-            check_grid(writer, plan.grid, params, [self.number], overwrite=True)
-            self._mark(to_json(params))
-            unrefined = replace(observe.poses, refine="never")
-            inputs = ScanSequence(near, plan, replace(observe, poses=unrefined))
-            inputs.prepare(None, Run(workers=1), lambda steps: None)
-            frame = inputs.frame(self.number)
-            made = FrameTask(self.number, frame, plan, inputs.metadata.classes, False).run()
-        except (CarlascError, OSError) as error:
-            return str(error)
-        grid = f"{plan.grid}/"
+        begun_s, done = time.monotonic(), MadeGrids()
+        sequence = self.sink.source().sequences_in([place_of(self.path)])[self.path]
+        frames = [one for one in sequence.frames("points").tolist() if one < self.known]
+        if self.key not in _DRIVES:
+            _DRIVES.clear()
+            _DRIVES[self.key] = _GrowingDrive(sequence, self.plan, self.writer, frames)
+        drive = _DRIVES[self.key]
+        new = drive.begin(sequence, frames)
+        for frame in new:
+            try:
+                drive.take(frame)
+                taken_s = drive.feed.time(frame) - drive.feed.time(new[0])
+                if frame == new[-1] or time.monotonic() - begun_s < taken_s:
+                    drive.make_grid(self.part, done)
+            except (CarlascError, OSError) as error:
+                done.problems.append(f"frame {frame}: {error}")
+        return done
+
+
+class _GrowingDrive:
+    """What is known of a drive: what moved in the last scans, and their free space."""
+
+    def __init__(
+        self, sequence: Sequence, plan: GridPlan, writer: SequenceWriter, frames: list[int]
+    ) -> None:
+        observe = cast(FromScans, plan.observe)
+        self.plan, self.writer, self.window = plan, writer, observe.window
+        if observe.motion.source != "none":
+            observe = replace(observe, motion=replace(observe.motion, source="evidence"))
+        self.feed = feed = ScanFeed(sequence, observe, is_growing=True)
+        self._judged = list[int]()  # the frames whose moving points are known
+        # a window and what shows motion in it, if it is begun in the middle of a drive
+        self._next = max(frames[-1] - 2 * (self.window[1] - self.window[0]), frames[0])
+        self._first = self._next - min(self.window[0], 0) if self._next > frames[0] else self._next
+        self._evidence = EvidenceWindow(after_s=_AFTER_S)
+        self._follower = ActorFollower(
+            deformable=feed.classes.deformable,
+            first_instance=FIRST_FOUND,
+            default_label=0 if feed.has_labels else feed.classes.geometry_id,
+        )
+        self._tracks, self._actors = list[Track](), MovingActors()
+        self._tracked_s, self._numbered, self._is_begun = -np.inf, 0, False
+
+    def begin(self, sequence: Sequence, frames: list[int]) -> list[int]:
+        """Return the scans to take: not all of them, if too many wait."""
+        self.feed.sequence = sequence
+        new = [frame for frame in frames if frame >= self._next]
+        return new[:: 1 + len(new) // _BEHIND]
+
+    def take(self, frame: int) -> None:
+        """Take a scan, and find what moved in the scans before it.
+
+        Raises:
+            FormatError: it is not valid.
+        """
+        self._next = frame + 1
+        if not self.feed.needs_actors:
+            self._judge(frame)
+            return
+        for found in self._evidence.add(self.feed.evidence_scan(frame, ())):
+            self._judge(found.frame)
+            self._tracks += map(self._track, self._follower.add(found.thinned()))
+
+    def _judge(self, frame: int) -> None:
+        """Add a frame to those that are merged."""
+        first, last = self.window
+        feed, now_s = self.feed, self.feed.time(frame)
+        self._judged.append(frame)
+        oldest = frame + first - last
+        self._judged = [f for f in self._judged if f >= oldest or now_s - feed.time(f) < _KEPT_S]
+        feed.use(self._judged)
+        self._follower.forget_before(self._judged[0])
+        self._tracks = [
+            track
+            for track in self._tracks
+            if track.first + len(track.world_T_actor) > self._judged[0]
+        ]
+
+    def make_grid(self, part: tuple[int, int], done: MadeGrids) -> None:
+        """Make and write the grid of the newest frame whose window is complete, unless it is
+        made.
+        """
+        number = self._newest(part)
+        if number is None:
+            return
+        if not self._is_begun:
+            self._begin_grid(number)
+        self._first = number + 1
+        near = self._actors_now().between(number + self.window[0], number + self.window[1])
+        frame, grid = ScanFrame(ScanWindow(self.feed, near), number, number), f"{self.plan.grid}/"
+        made = FrameTask(number, frame, self.plan, self.feed.classes, False).run()
         fields = {name: data for name, data in made.outputs.items() if name.startswith(grid)}
         if fields:
-            writer.write_frames({self.number: fields})
-        return made.error
+            self.writer.write_frames({number: fields})
+            done.numbers.append(number)
+        if made.error:
+            done.problems.append(f"no grid of frame {number} yet: {made.error}")
 
-    def _mark(self, params: bytes) -> None:
-        """Note that the grid is provisional; remove frames with other settings."""
-        name, document = f"made-{self.plan.grid}", layout.params_file(self.plan.grid)
-        MadeFrom(PROVISIONAL).write(self.writer, name)
-        if (existing := self.writer.read_document(document)) != params:
+    def _newest(self, part: tuple[int, int]) -> int | None:
+        index, count = part
+        ready = [
+            frame
+            for frame in self._judged
+            if self._first <= frame <= self._judged[-1] - self.window[1] and frame % count == index
+        ]
+        return max(ready, default=None)
+
+    def _begin_grid(self, number: int) -> None:
+        """Note that grids are provisional; remove frames with other settings.
+
+        Raises:
+            ConflictError: the grid is not one of carlasc's.
+        """
+        plan, writer = self.plan, self.writer
+        inputs = ScanSequence(self.feed.sequence, plan, cast(FromScans, plan.observe))
+        params = settings_of(inputs, plan)
+        check_grid(writer, plan.grid, params, [number], overwrite=True)
+        document = layout.params_file(plan.grid)
+        MadeFrom(PROVISIONAL).write(writer, f"made-{plan.grid}")
+        if (existing := writer.read_document(document)) != to_json(params):
             if existing is not None:
-                self.writer.remove_grid(self.plan.grid)
-            self.writer.write_document(document, params)
+                writer.remove_grid(plan.grid)
+            writer.write_document(document, to_json(params))
+        self._is_begun = True
+
+    def _track(self, actor: FoundActor) -> Track:
+        return track_of(actor, self.feed.times, self.feed.classes.deformable)
+
+    def _actors_now(self) -> MovingActors:
+        """Return the moving actors, with the tracks of the last second at least."""
+        now_s = self.feed.time(self._judged[-1])
+        if now_s - self._tracked_s >= _AGAIN_S and self.feed.needs_actors:
+            self._tracked_s = now_s
+            follower, living = self._follower.ended_now()
+            every = [*self._tracks, *map(self._track, living)]
+            every = [track for track in every if track.instance not in follower.riders]
+            moving = untracked(follower.moved, [track for track in every if track.is_possible])
+            actors = MovingActors.of(complete_bodies(every), moving, follower.own)
+            # what was kept of an actor is not of this track of it: each gets a new number
+            numbered = {self._numbered + n: track for n, track in actors.tracks.items()}
+            self._numbered += len(every)
+            self._actors = replace(actors, tracks=numbered)
+            if self.plan.voting.keep_actors:
+                self._actors = with_numbers(self._actors, self.feed)
+        return replace(self._actors, moving={**self._follower.moved, **self._actors.moving})
+
+
+_DRIVES: dict[str, _GrowingDrive] = {}  # the drive of this process, by its key

@@ -6,6 +6,7 @@ They are followed from scan to scan.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -183,6 +184,25 @@ class ActorFollower:
             if wide[cells].all():  # found by their place
                 self.moved[frame] = np.setdiff1d(self.moved[frame], members)
         return [actor for actor in actors if actor.segments[0].instance not in self.riders]
+
+    def ended_now(self) -> tuple[ActorFollower, list[FoundActor]]:
+        """Return what `finish` would leave and return if no scan came any more. It does not change
+        what later scans give.
+        """
+        now = copy(self)
+        now.moved, now.riders = dict(self.moved), set(self.riders)
+        now._cells, now._beside = dict(self._cells), list(self._beside)
+        return now, now.finish()
+
+    def forget_before(self, frame: int) -> None:
+        """Forget observations before a frame, but not those of how the last scans move."""
+        self.moved = {scan: moved for scan, moved in self.moved.items() if scan >= frame}
+        self._close = [close for close in self._close if close[0] >= frame]
+        for one in self._alive:
+            one.links = [
+                *(link for link in one.links[:-_HISTORY] if link.segment.frame >= frame),
+                *one.links[-_HISTORY:],
+            ]
 
     def _own_cells(self) -> BoolArray:
         """Return the cells of the recording vehicle, as a cube: what stays at one place of the

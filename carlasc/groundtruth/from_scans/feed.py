@@ -24,7 +24,7 @@ from carlasc.core.arrays import (
     IntArray,
     LabelArray,
 )
-from carlasc.core.geometry import invert, moved_back, transform_points
+from carlasc.core.geometry import Transform, invert, moved_back, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan, check_finite, lengths, sorted_by_origin
 from carlasc.errors import FormatError, MissingDataError
@@ -132,11 +132,11 @@ class ScanFeed:
         max_range_m: farther points are left out, in metres.
         key: the same for all copies of a feed.
         contents: digest of each scan that was compared.
-        pose: returns (4, 4) first_T_sensor of a frame.
+        is_growing: whether scans come, see `use`.
     """
 
-    def __init__(self, sequence: Sequence, options: FromScans) -> None:
-        self.sequence, self.options = sequence, options
+    def __init__(self, sequence: Sequence, options: FromScans, *, is_growing: bool = False) -> None:
+        self.sequence, self.options, self.is_growing = sequence, options, is_growing
         metadata = sequence.metadata
         self.classes = metadata.classes
         self.min_range_m = (
@@ -153,7 +153,9 @@ class ScanFeed:
         self._lock = threading.RLock()  # an executor may be of threads
         self.key = uuid4().hex
         self.contents: dict[int, str] = {}
-        self.pose = cache(sequence.read_pose)
+        self._poses = dict[int, Transform]()
+        if is_growing:
+            self.frames, self.times = np.empty(0, np.int64), {}
 
     def __reduce__(self) -> tuple[Callable[..., ScanFeed], tuple[Any, ...]]:
         return _restore, (self.key, without_caches(self.sequence), self.options)
@@ -182,9 +184,21 @@ class ScanFeed:
             self.contents |= content_digests(SequenceFiles(self.sequence), missing, writer, run=run)
         return combined(*(self.contents[frame] for frame in self.frames.tolist()))
 
+    def use(self, frames: list[int]) -> None:
+        """Merge other scans of a growing sequence from now on; others are forgotten."""
+        self.times = {frame: self.time(frame) for frame in frames}
+        self.frames = np.array(frames)
+        self._poses = {frame: self._poses[frame] for frame in frames if frame in self._poses}
+
+    def pose(self, frame: int) -> Transform:
+        """Return (4, 4) first_T_sensor of a frame."""
+        if frame not in self._poses:
+            self._poses[frame] = self.sequence.read_pose(frame)
+        return self._poses[frame]
+
     @cached_property
     def frames(self) -> IntArray:
-        """The sequence's frames with points, sorted."""
+        """The frames with points, sorted; of a growing sequence, those that are used."""
         return self.sequence.frames("points")
 
     @cached_property
@@ -352,6 +366,8 @@ class ScanFeed:
             return transform_points(self.pose(frame), corners)
 
         def cast_of(frame: int, within_s: float) -> Cast:
+            if self.is_growing:  # the grids of later frames are not known
+                return self.read(frame).cast(map_T_world, *np.full((2, 3), np.inf) * [[-1], [1]])
             # of all frames, made or not: counts do not depend on which frames are made
             near = self.frames[(self.frames >= frame - last) & (self.frames <= frame - first)]
             grids = [

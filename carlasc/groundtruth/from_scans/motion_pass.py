@@ -89,7 +89,7 @@ def _find_evidence(*args: Any, **options: Any) -> list[FreeSpaceEvidence]:
     return list(_evidence_of(*args, **options))
 
 
-def _make_track(actor: FoundActor, times: dict[int, float], deformable: frozenset[int]) -> Track:
+def track_of(actor: FoundActor, times: dict[int, float], deformable: frozenset[int]) -> Track:
     """Estimate the track of one actor, in a worker."""
     chain, rigid, sure, path = actor
     return make_track(chain, times, deformable=deformable, rigid=rigid, confidence=sure, path=path)
@@ -154,7 +154,7 @@ def find_actors(
     found = [track for track in found if track.instance not in follower.riders]
     tracks += found
     # points of what is too large for one actor moved, but not together
-    moving = _untracked(follower.moved, [track for track in found if track.is_possible])
+    moving = untracked(follower.moved, [track for track in found if track.is_possible])
     tracks = tracks if boxes else complete_bodies(tracks)
     return MovingActors.of(tracks, moving, follower.own, follower.seen)
 
@@ -203,12 +203,12 @@ def _boxed(
 
 def _estimate(feed: ScanFeed, run: Run, actors: Iterable[FoundActor]) -> list[Track]:
     """Return the tracks of actors."""
-    make = partial(_make_track, times=feed.times, deformable=feed.classes.deformable)
+    make = partial(track_of, times=feed.times, deformable=feed.classes.deformable)
     with _each(make, actors, run) as tracks:
         return list(tracks)
 
 
-def _untracked(moved: dict[int, Int32Array], tracks: list[Track]) -> dict[int, AnyIntArray]:
+def untracked(moved: dict[int, Int32Array], tracks: list[Track]) -> dict[int, AnyIntArray]:
     """Return the moved points of each frame that belong to no track."""
     tracked: dict[int, list[AnyIntArray]] = {}
     for track in tracks:
