@@ -9,7 +9,6 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future
-from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -84,7 +83,6 @@ def follow(
     poses: PoseOptions = PoseOptions(),  # noqa: B008 (frozen)
     grids: GridOptions | None = GridOptions(),  # noqa: B008 (frozen)
     options: Mapping[str, Any] | None = None,
-    run: Run = Run(),  # noqa: B008 (frozen)
     say: Callable[[str], None] = lambda line: None,
     wait: Callable[[float], None] = time.sleep,
 ) -> None:
@@ -105,7 +103,6 @@ def follow(
         poses: how poses are estimated.
         grids: the grids; None makes none.
         options: options of the converter, by name.
-        run: number of processes.
         say: called with what happens, one line each.
         wait: waits for some seconds, between two looks at the folder.
 
@@ -126,11 +123,9 @@ def follow(
     poses, layout = replace(poses, source="kiss-icp"), replace(layout, boxes=None)
     converter = open_converter(name, root, options)
     look = _Folder(converter, idle_s, say, wait)
-    with ExitStack() as pools:
-        # one process makes grids, even on one core; each keeps what it knows of the drive
-        makers = [pools.enter_context(own_processes(1)) for _ in range(max(run.processes - 1, 1))]
+    with own_processes(1) as maker:
         documents = describe(converter, name, layout)
-        drive = _Drive(look, converter, sink, layout, documents, poses, grids, makers)
+        drive = _Drive(look, converter, sink, layout, documents, poses, grids, maker)
         try:
             drive.run()
         except KeyboardInterrupt:
@@ -204,7 +199,7 @@ class _Drive:
         metadata: the entries of carlasc.json that do not depend on scans.
         poses: how poses are estimated.
         grids: the grids; None makes none.
-        makers: a process each, which makes grids.
+        maker: a process that makes grids.
         arrived: time of the file of each scan, by frame number.
         lines: pose of each scan, first_T_scan, as far as they are estimated.
     """
@@ -216,15 +211,15 @@ class _Drive:
     metadata: Metadata
     poses: PoseOptions
     grids: GridOptions | None
-    makers: list[Executor]
+    maker: Executor
     arrived: list[float] = field(default_factory=list)
     lines: list[Transform] = field(default_factory=list)
     _waiting: dict[int, tuple[FrameHandle, Assembled]] = field(default_factory=dict)
     _written: int = 0
     _grid: GridPlan | None = None
-    _making: dict[int, list[Future[MadeGrids]]] = field(default_factory=dict)
+    _making: list[Future[MadeGrids]] = field(default_factory=list)
     _made: list[int] = field(default_factory=list)
-    _told: dict[int, int] = field(default_factory=dict)
+    _told: int = 0
     _key: str = field(default_factory=lambda: uuid4().hex)
     _said: float = 0.0
 
@@ -330,28 +325,17 @@ class _Drive:
         return VehicleMotion(Trajectory(vehicle, times), float(self.plan.times[number]))
 
     def _make_grids(self, grids: GridOptions) -> None:
-        """Take grids that are made, and tell the makers of new scans; each has one call to wait
-        for, and one more to go on with.
+        """Take grids that are made, and tell the maker of new scans: it has one call to work on,
+        and one more to go on with.
         """
         if self._grid is None:
             self._grid = self._plan(grids, self.sink.source())
-        path, known = sequence_path(self.plan.recording), self._written
-        for index, maker in enumerate(self.makers):
-            making, told = self._making.setdefault(index, []), self._told.get(index, 0)
-            while making and making[0].done():
-                self._take(making.pop(0).result())
-            if known > told and len(making) < _CALLS:
-                self._told[index] = known
-                new = NewScans(
-                    f"{self._key}-{index}",
-                    self.sink,
-                    path,
-                    self.plan.writer,
-                    self._grid,
-                    known,
-                    (index, len(self.makers)),
-                )
-                making.append(maker.submit(NewScans.make, new))
+        while self._making and self._making[0].done():
+            self._take(self._making.pop(0).result())
+        if self._written > self._told and len(self._making) < _CALLS:
+            self._told, path = self._written, sequence_path(self.plan.recording)
+            about = self.sink, path, self.plan.writer, self._grid, self._written
+            self._making.append(self.maker.submit(NewScans.make, NewScans(self._key, *about)))
 
     def _take(self, made: MadeGrids) -> None:
         """Note what a maker made."""
@@ -396,10 +380,13 @@ class _Drive:
         )
 
     def finish(self) -> None:
-        """Wait for the grids that are being made, and say what there is."""
-        for making in self._making.values():
-            for grids in making:
-                self._take(grids.result())
+        """Wait for the grids that are being made, then for those of the last scans; say what there
+        is.
+        """
+        for _ in range(2):
+            while self._making:
+                self._take(self._making.pop(0).result())
+            self.write()
         made = len(self._made)
         self.folder.say(
             f"the drive has {count(len(self.arrived), 'scan')}; "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, field, replace
 from typing import cast
@@ -28,9 +29,10 @@ from carlasc.storage.protocol import Sequence, SequenceWriter, Sink
 from carlasc.storage.resuming import check_grid
 
 _AFTER_S = 0.8  # scans up to so much later show what moves in a scan
-_AGAIN_S = 1.0  # tracks are estimated again after so much of the drive
-_KEPT_S = 10.0  # how long observations of actors are kept
-_BEHIND = 15  # with so many scans more that wait, every second one is used, and so on
+_AGAIN_S = 2.0  # tracks are estimated again after so much of the drive
+_KEPT_S = 8.0  # how long observations of actors are kept
+_EVERY, _BEHIND = 3, 15  # N before the first grid; N grows by one with so many scans that wait
+_MEAN_OF = 10  # about so many of the last scans and grids show how much time there is
 
 
 @dataclass
@@ -48,19 +50,19 @@ class MadeGrids:
 
 @dataclass(frozen=True)
 class NewScans:
-    """Scans that were written since the last call, for a process that makes provisional grids.
+    """Scans that were written since the last call, for the process that makes provisional grids.
 
     The process keeps what it knows of the drive from call to call, so each scan is read and
-    searched for motion once, and each ray is followed once. Poses are not refined.
+    searched for motion once, and each ray is followed once. Poses are not refined. Every N-th scan
+    is merged, and its frame gets a grid: N is what the process has time for.
 
     Attributes:
-        key: of the drive and its process.
+        key: of the drive.
         sink: the output.
         path: path of the sequence.
         writer: writes beside it.
         plan: the plan of the final grids.
         known: number of frames whose poses are written.
-        part: which of so many processes this one is: it makes the grids of every so many-th frame.
     """
 
     key: str
@@ -69,31 +71,31 @@ class NewScans:
     writer: SequenceWriter
     plan: GridPlan
     known: int
-    part: tuple[int, int] = (0, 1)
 
     def make(self) -> MadeGrids:
-        """Take the scans, and make grids, marked as provisional, as long as this takes less time
-        than the sensor took; at least that of the newest frame whose window is complete.
+        """Take the scans, and make the grids of frames whose windows are complete, marked as
+        provisional.
 
         Raises:
             StorageError: a grid cannot be written.
         """
-        begun_s, done = time.monotonic(), MadeGrids()
+        done = MadeGrids()
         sequence = self.sink.source().sequences_in([place_of(self.path)])[self.path]
         frames = [one for one in sequence.frames("points").tolist() if one < self.known]
+        if not frames:
+            return done
         if self.key not in _DRIVES:
             _DRIVES.clear()
             _DRIVES[self.key] = _GrowingDrive(sequence, self.plan, self.writer, frames)
         drive = _DRIVES[self.key]
-        new = drive.begin(sequence, frames)
-        for frame in new:
+        for frame in drive.choose(sequence, frames):
+            begun_s = time.monotonic()
             try:
                 drive.take(frame)
-                taken_s = drive.feed.time(frame) - drive.feed.time(new[0])
-                if frame == new[-1] or time.monotonic() - begun_s < taken_s:
-                    drive.make_grid(self.part, done)
+                drive.make_grid(done)
             except (CarlascError, OSError) as error:
                 done.problems.append(f"frame {frame}: {error}")
+            drive.note_time(time.monotonic() - begun_s)
         return done
 
 
@@ -108,10 +110,11 @@ class _GrowingDrive:
         if observe.motion.source != "none":
             observe = replace(observe, motion=replace(observe.motion, source="evidence"))
         self.feed = feed = ScanFeed(sequence, observe, is_growing=True)
+        # if it is begun in the middle of a drive, with a whole window
+        first, last = self.window
+        self._next = max(frames[0], frames[-1] - 2 * (last - first))
+        self._first = self._next - (min(first, 0) if self._next > frames[0] else 0)
         self._judged = list[int]()  # the frames whose moving points are known
-        # a window and what shows motion in it, if it is begun in the middle of a drive
-        self._next = max(frames[-1] - 2 * (self.window[1] - self.window[0]), frames[0])
-        self._first = self._next - min(self.window[0], 0) if self._next > frames[0] else self._next
         self._evidence = EvidenceWindow(after_s=_AFTER_S)
         self._follower = ActorFollower(
             deformable=feed.classes.deformable,
@@ -120,12 +123,25 @@ class _GrowingDrive:
         )
         self._tracks, self._actors = list[Track](), MovingActors()
         self._tracked_s, self._numbered, self._is_begun = -np.inf, 0, False
+        self._every = _EVERY
+        self._spent_s: float | None = None  # time for a scan and its grid, a mean of the last ones
 
-    def begin(self, sequence: Sequence, frames: list[int]) -> list[int]:
-        """Return the scans to take: not all of them, if too many wait."""
+    def choose(self, sequence: Sequence, frames: list[int]) -> list[int]:
+        """Return the scans to take: every N-th one, more of them the faster they are taken."""
         self.feed.sequence = sequence
-        new = [frame for frame in frames if frame >= self._next]
-        return new[:: 1 + len(new) // _BEHIND]
+        new, last = [frame for frame in frames if frame >= self._next], frames[-_MEAN_OF:]
+        if self._spent_s is not None and len(last) > 1:
+            period_s = (self.feed.time(last[-1]) - self.feed.time(last[0])) / (len(last) - 1)
+            self._every = max(math.ceil(self._spent_s / max(period_s, 1e-3)), 1)
+        self._every += len(new) // _BEHIND
+        return new[:: self._every]
+
+    def note_time(self, spent_s: float) -> None:
+        """Note how long a scan and its grid took, after the first grid."""
+        if self._spent_s is not None:
+            spent_s = self._spent_s + (spent_s - self._spent_s) / _MEAN_OF
+        if self._is_begun:
+            self._spent_s = spent_s
 
     def take(self, frame: int) -> None:
         """Take a scan, and find what moved in the scans before it.
@@ -133,11 +149,13 @@ class _GrowingDrive:
         Raises:
             FormatError: it is not valid.
         """
-        self._next = frame + 1
+        self._next = frame + self._every
         if not self.feed.needs_actors:
             self._judge(frame)
             return
-        for found in self._evidence.add(self.feed.evidence_scan(frame, ())):
+        scan = self.feed.evidence_scan(frame, ())
+        self.feed.read(frame)  # now, as it is at hand
+        for found in self._evidence.add(scan):
             self._judge(found.frame)
             self._tracks += map(self._track, self._follower.add(found.thinned()))
 
@@ -156,13 +174,15 @@ class _GrowingDrive:
             if track.first + len(track.world_T_actor) > self._judged[0]
         ]
 
-    def make_grid(self, part: tuple[int, int], done: MadeGrids) -> None:
+    def make_grid(self, done: MadeGrids) -> None:
         """Make and write the grid of the newest frame whose window is complete, unless it is
         made.
         """
-        number = self._newest(part)
-        if number is None:
+        last = self._judged[-1] - self.window[1] if self._judged else -1
+        ready = [frame for frame in self._judged if self._first <= frame <= last]
+        if not ready:
             return
+        number = ready[-1]
         if not self._is_begun:
             self._begin_grid(number)
         self._first = number + 1
@@ -175,15 +195,6 @@ class _GrowingDrive:
             done.numbers.append(number)
         if made.error:
             done.problems.append(f"no grid of frame {number} yet: {made.error}")
-
-    def _newest(self, part: tuple[int, int]) -> int | None:
-        index, count = part
-        ready = [
-            frame
-            for frame in self._judged
-            if self._first <= frame <= self._judged[-1] - self.window[1] and frame % count == index
-        ]
-        return max(ready, default=None)
 
     def _begin_grid(self, number: int) -> None:
         """Note that grids are provisional; remove frames with other settings.

@@ -51,7 +51,7 @@ class Feed:
 
     def follow(self, out: Path, **options) -> None:
         self.folder.mkdir(exist_ok=True)
-        settings = {"idle_s": 4, "grids": None, "run": Run(2), "wait": self.wait}
+        settings = {"idle_s": 4, "grids": None, "wait": self.wait}
         follow("scans", self.folder, out, say=self.said.append, **settings | options)
 
     def has_said(self, text: str) -> bool:

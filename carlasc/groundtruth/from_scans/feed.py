@@ -69,6 +69,7 @@ _USED = (
 )
 _STEP_S = 0.005  # points of a scan within this time are seen at one instant: 7 cm at 15 m/s
 _LATE_S = 3.0  # no point is farther in time from its frame: see `check_scan`
+_READ_AHEAD = 20  # scans that are read before they are merged, while a sequence grows
 _PARTS = 30  # with `window_m`, scans are at least this part of it apart
 
 
@@ -154,6 +155,7 @@ class ScanFeed:
         self.key = uuid4().hex
         self.contents: dict[int, str] = {}
         self._poses = dict[int, Transform]()
+        self._last: tuple[int, Scan] | None = None
         if is_growing:
             self.frames, self.times = np.empty(0, np.int64), {}
 
@@ -413,7 +415,7 @@ class ScanFeed:
                 # A window of scans and one more: frames are made in order, and the next one needs
                 # all of them but the first.
                 first, last = self.options.window
-                while len(self._scans) > last - first + 2:
+                while len(self._scans) > last - first + 2 + _READ_AHEAD * self.is_growing:
                     self._scans.popitem(last=False)
             self._scans.move_to_end(frame)
             return self._scans[frame]
@@ -496,10 +498,17 @@ class ScanFeed:
         return segment_by_boxes(frame, scan, pose, boxes, ground=ground) if by == "boxes" else []
 
     def _voting_points(self, frame: int) -> Scan:
-        """Read the voting points of a scan: without unlabelled, too near and too far ones.
+        """Return the voting points of a scan: without unlabelled, too near and too far ones. The
+        last scan is kept.
 
         Points with one origin follow each other.
         """
+        with self._lock:
+            if self._last is None or self._last[0] != frame:
+                self._last = frame, self._read(frame)
+            return self._last[1]
+
+    def _read(self, frame: int) -> Scan:
         scan = self.sequence.scan(frame, _USED)
         check_finite(scan.points, f"{self.sequence.location}: points of frame {frame}")
         if scan.labels is None:
