@@ -32,6 +32,7 @@ _AFTER_S = 0.8  # scans up to so much later show what moves in a scan
 _AGAIN_S = 2.0  # tracks are estimated again after so much of the drive
 _KEPT_S = 8.0  # how long observations of actors are kept
 _EVERY, _BEHIND = 3, 15  # N before the first grid; N grows by one with so many scans that wait
+_BEFORE = 40  # scans before a window, if the pass begins in the middle of a drive
 _MEAN_OF = 10  # about so many of the last scans and grids show how much time there is
 
 
@@ -112,7 +113,7 @@ class _GrowingDrive:
         self.feed = feed = ScanFeed(sequence, observe, is_growing=True)
         # if it is begun in the middle of a drive, with a whole window
         first, last = self.window
-        self._next = max(frames[0], frames[-1] - 2 * (last - first))
+        self._next = max(frames[0], frames[-1] - (last - first) - _BEFORE)
         self._first = self._next - (min(first, 0) if self._next > frames[0] else 0)
         self._judged = list[int]()  # the frames whose moving points are known
         self._evidence = EvidenceWindow(after_s=_AFTER_S)
@@ -130,10 +131,11 @@ class _GrowingDrive:
         """Return the scans to take: every N-th one, more of them the faster they are taken."""
         self.feed.sequence = sequence
         new, last = [frame for frame in frames if frame >= self._next], frames[-_MEAN_OF:]
+        every = _EVERY
         if self._spent_s is not None and len(last) > 1:
             period_s = (self.feed.time(last[-1]) - self.feed.time(last[0])) / (len(last) - 1)
-            self._every = max(math.ceil(self._spent_s / max(period_s, 1e-3)), 1)
-        self._every += len(new) // _BEHIND
+            every = max(math.ceil(self._spent_s / max(period_s, 1e-3)), 1)
+        self._every = every + len(new) // _BEHIND
         return new[:: self._every]
 
     def note_time(self, spent_s: float) -> None:
