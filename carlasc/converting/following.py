@@ -51,7 +51,7 @@ from carlasc.errors import (
 )
 from carlasc.groundtruth.inputs import GridPlan
 from carlasc.groundtruth.options import FromScans, GridOptions, Voting
-from carlasc.groundtruth.provisional import MadeGrids, NewScans
+from carlasc.groundtruth.provisional import make_provisional
 from carlasc.inspection.pose_quality import describe_jumps
 from carlasc.motion import odometry
 from carlasc.motion.options import PoseOptions
@@ -217,7 +217,7 @@ class _Drive:
     _waiting: dict[int, tuple[FrameHandle, Assembled]] = field(default_factory=dict)
     _written: int = 0
     _grid: GridPlan | None = None
-    _making: list[Future[MadeGrids]] = field(default_factory=list)
+    _making: list[Future[tuple[list[int], list[str]]]] = field(default_factory=list)
     _made: list[int] = field(default_factory=list)
     _told: int = 0
     _key: str = field(default_factory=lambda: uuid4().hex)
@@ -334,17 +334,18 @@ class _Drive:
             self._take(self._making.pop(0).result())
         if self._written > self._told and len(self._making) < _CALLS:
             self._told, path = self._written, sequence_path(self.plan.recording)
-            about = self.sink, path, self.plan.writer, self._grid, self._written
-            self._making.append(self.maker.submit(NewScans.make, NewScans(self._key, *about)))
+            about = self._key, self.sink, path, self.plan.writer, self._grid, self._written
+            self._making.append(self.maker.submit(make_provisional, *about))
 
-    def _take(self, made: MadeGrids) -> None:
-        """Note what a maker made."""
-        for problem in made.problems:
+    def _take(self, made: tuple[list[int], list[str]]) -> None:
+        """Note what the maker made."""
+        numbers, problems = made
+        for problem in problems:
             self.folder.say(problem)
-        self._made += made.numbers
-        if made.numbers and self._grid is not None:
+        self._made += numbers
+        if numbers and self._grid is not None:
             observe = cast(FromScans, self._grid.observe)
-            self._report(made.numbers[-1] + observe.window[1])
+            self._report(numbers[-1] + observe.window[1])
 
     def _plan(self, grids: GridOptions, source: Source) -> GridPlan:
         """Return the plan of the grids, by the ground and the reach of the scans so far."""

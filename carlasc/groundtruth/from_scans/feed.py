@@ -24,7 +24,7 @@ from carlasc.core.arrays import (
     IntArray,
     LabelArray,
 )
-from carlasc.core.geometry import Transform, invert, moved_back, transform_points
+from carlasc.core.geometry import invert, moved_back, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan, check_finite, lengths, sorted_by_origin
 from carlasc.errors import FormatError, MissingDataError
@@ -69,7 +69,6 @@ _USED = (
 )
 _STEP_S = 0.005  # points of a scan within this time are seen at one instant: 7 cm at 15 m/s
 _LATE_S = 3.0  # no point is farther in time from its frame: see `check_scan`
-_READ_AHEAD = 20  # scans that are read before they are merged, while a sequence grows
 _PARTS = 30  # with `window_m`, scans are at least this part of it apart
 
 
@@ -133,11 +132,14 @@ class ScanFeed:
         max_range_m: farther points are left out, in metres.
         key: the same for all copies of a feed.
         contents: digest of each scan that was compared.
-        is_growing: whether scans come, see `use`.
+        pose: returns (4, 4) first_T_sensor of a frame.
+        is_growing: whether more scans come: see `use`.
     """
 
-    def __init__(self, sequence: Sequence, options: FromScans, *, is_growing: bool = False) -> None:
-        self.sequence, self.options, self.is_growing = sequence, options, is_growing
+    is_growing = False
+
+    def __init__(self, sequence: Sequence, options: FromScans) -> None:
+        self.sequence, self.options = sequence, options
         metadata = sequence.metadata
         self.classes = metadata.classes
         self.min_range_m = (
@@ -154,10 +156,7 @@ class ScanFeed:
         self._lock = threading.RLock()  # an executor may be of threads
         self.key = uuid4().hex
         self.contents: dict[int, str] = {}
-        self._poses = dict[int, Transform]()
-        self._last: tuple[int, Scan] | None = None
-        if is_growing:
-            self.frames, self.times = np.empty(0, np.int64), {}
+        self.pose = cache(sequence.read_pose)
 
     def __reduce__(self) -> tuple[Callable[..., ScanFeed], tuple[Any, ...]]:
         return _restore, (self.key, without_caches(self.sequence), self.options)
@@ -187,20 +186,14 @@ class ScanFeed:
         return combined(*(self.contents[frame] for frame in self.frames.tolist()))
 
     def use(self, frames: list[int]) -> None:
-        """Merge other scans of a growing sequence from now on; others are forgotten."""
+        """Merge only these frames of a growing sequence from now on."""
+        self.is_growing, self.frames = True, np.array(frames, np.int64)
         self.times = {frame: self.time(frame) for frame in frames}
-        self.frames = np.array(frames)
-        self._poses = {frame: self._poses[frame] for frame in frames if frame in self._poses}
-
-    def pose(self, frame: int) -> Transform:
-        """Return (4, 4) first_T_sensor of a frame."""
-        if frame not in self._poses:
-            self._poses[frame] = self.sequence.read_pose(frame)
-        return self._poses[frame]
+        self.pose = cache(self.sequence.read_pose)
 
     @cached_property
     def frames(self) -> IntArray:
-        """The frames with points, sorted; of a growing sequence, those that are used."""
+        """The sequence's frames with points, sorted."""
         return self.sequence.frames("points")
 
     @cached_property
@@ -369,7 +362,7 @@ class ScanFeed:
 
         def cast_of(frame: int, within_s: float) -> Cast:
             if self.is_growing:  # the grids of later frames are not known
-                return self.read(frame).cast(map_T_world, *np.full((2, 3), np.inf) * [[-1], [1]])
+                return self.read(frame).cast(map_T_world, np.full(3, -np.inf), np.full(3, np.inf))
             # of all frames, made or not: counts do not depend on which frames are made
             near = self.frames[(self.frames >= frame - last) & (self.frames <= frame - first)]
             grids = [
@@ -415,7 +408,7 @@ class ScanFeed:
                 # A window of scans and one more: frames are made in order, and the next one needs
                 # all of them but the first.
                 first, last = self.options.window
-                while len(self._scans) > last - first + 2 + _READ_AHEAD * self.is_growing:
+                while len(self._scans) > last - first + 2:
                     self._scans.popitem(last=False)
             self._scans.move_to_end(frame)
             return self._scans[frame]
@@ -498,17 +491,10 @@ class ScanFeed:
         return segment_by_boxes(frame, scan, pose, boxes, ground=ground) if by == "boxes" else []
 
     def _voting_points(self, frame: int) -> Scan:
-        """Return the voting points of a scan: without unlabelled, too near and too far ones. The
-        last scan is kept.
+        """Read the voting points of a scan: without unlabelled, too near and too far ones.
 
         Points with one origin follow each other.
         """
-        with self._lock:
-            if self._last is None or self._last[0] != frame:
-                self._last = frame, self._read(frame)
-            return self._last[1]
-
-    def _read(self, frame: int) -> Scan:
         scan = self.sequence.scan(frame, _USED)
         check_finite(scan.points, f"{self.sequence.location}: points of frame {frame}")
         if scan.labels is None:

@@ -129,16 +129,12 @@ def find_actors(
     tracks = _boxed(feed, run, steps, boxes, moving_boxes) if boxes else _linked(feed, run, steps)
     if "evidence" not in feed.motion:
         return MovingActors.of(tracks if boxes else complete_bodies(tracks))
-    frames, classes = list(feed.times), feed.classes
+    frames = list(feed.times)
     # A block reads the seconds around it too: longer blocks repeat less, and shorter ones keep all
     # processes busy.
     size = min(max(-(-len(frames) // run.processes), _BLOCK[0]), _BLOCK[1])
     blocks = [tuple(frames[begin : begin + size]) for begin in range(0, len(frames), size)]
-    follower = ActorFollower(
-        deformable=classes.deformable,
-        first_instance=FIRST_FOUND,
-        default_label=0 if feed.has_labels else classes.geometry_id,
-    )
+    follower = follower_of(feed)
     found, waiting = list[Track](), list[FoundActor]()
     # This process gives each scan as soon as it can, so that progress moves.
     is_here = run.executor is None and (run.processes == 1 or len(blocks) == 1)
@@ -157,6 +153,15 @@ def find_actors(
     moving = untracked(follower.moved, [track for track in found if track.is_possible])
     tracks = tracks if boxes else complete_bodies(tracks)
     return MovingActors.of(tracks, moving, follower.own, follower.seen)
+
+
+def follower_of(feed: ScanFeed) -> ActorFollower:
+    """Return what follows the actors that the evidence of a sequence shows."""
+    return ActorFollower(
+        deformable=feed.classes.deformable,
+        first_instance=FIRST_FOUND,
+        default_label=0 if feed.has_labels else feed.classes.geometry_id,
+    )
 
 
 def _linked(feed: ScanFeed, run: Run, steps: Callable[[int], None]) -> list[Track]:
