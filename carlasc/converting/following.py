@@ -89,10 +89,10 @@ def follow(
     """Convert the scans of a growing folder as they appear, until no scan comes any more or Ctrl-C.
 
     A scan is taken when its size did not change between two looks. Its pose is estimated from the
-    scans before it, whatever poses the recording has. One process takes scans, and the others make
-    the grid of the newest frame whose window is complete, again and again: the faster they are, the
-    more frames get one. All of this is marked as provisional, and `convert` with the same arguments
-    replaces it: its result does not depend on what was made here.
+    scans before it, whatever poses the recording has. This process takes scans, and another one
+    makes grids of frames whose windows are complete: of as many as it has time for. All of this is
+    marked as provisional, and `convert` with the same arguments replaces it: its result does not
+    depend on what was made here.
 
     Args:
         name: the converter, of a data set with one recording: "scans".
@@ -200,7 +200,7 @@ class _Drive:
         poses: how poses are estimated.
         grids: the grids; None makes none.
         maker: a process that makes grids.
-        arrived: time of the file of each scan, by frame number.
+        arrived: time of the file of each scan, or of the start after it, by frame number.
         lines: pose of each scan, first_T_scan, as far as they are estimated.
     """
 
@@ -220,6 +220,7 @@ class _Drive:
     _making: list[Future[tuple[list[int], list[str]]]] = field(default_factory=list)
     _made: list[int] = field(default_factory=list)
     _told: int = 0
+    _begun_s: float = field(default_factory=time.time)
     _key: str = field(default_factory=lambda: uuid4().hex)
     _said: float = 0.0
 
@@ -248,7 +249,7 @@ class _Drive:
                 self._begin()
             at_s = number * files.FRAME_PERIOD_S if seconds is None else seconds
             self.plan.times = np.append(self.plan.times, at_s)
-            self.arrived.append(_state(handle.location)[1] / 1e9)
+            self.arrived.append(max(_state(handle.location)[1] / 1e9, self._begun_s))
             try:
                 scan = read_scan(handle, self.plan.rig, None)
             except (CarlascError, OSError) as error:

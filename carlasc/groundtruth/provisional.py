@@ -92,7 +92,7 @@ class _GrowingDrive:
         if observe.motion.source != "none":
             observe = replace(observe, motion=replace(observe.motion, source="evidence"))
         self.feed = feed = ScanFeed(sequence, observe)
-        feed.use([])
+        feed.use(sequence, [])
         # in the middle of a drive, the first grid has a whole window
         self._next = max(frames[0], frames[-1] - self.last + self.first - _BEFORE)
         self._unmade = self._next - min(self.first, 0) * (self._next > frames[0])
@@ -106,7 +106,7 @@ class _GrowingDrive:
 
     def choose(self, sequence: Sequence, frames: list[int]) -> list[int]:
         """Return the scans to take: every N-th one."""
-        self.feed.sequence = sequence
+        self.feed.use(sequence, self._judged)
         new = [frame for frame in frames if frame >= self._next]
         period_s = float(np.median(np.diff(sequence.times_of(frames[-_MEAN_OF:]))))
         self._every = max(math.ceil(self.spent_s / max(period_s, 1e-3)), 1) + len(new) // _BEHIND
@@ -130,7 +130,7 @@ class _GrowingDrive:
         """Merge a frame from now on, and forget old ones."""
         oldest = frame - max(self.last - self.first, _KEPT)
         self._judged = [one for one in [*self._judged, frame] if one >= oldest]
-        self.feed.use(self._judged)
+        self.feed.use(self.feed.sequence, self._judged)
         self._follower.forget_before(oldest)
         self._tracks = [track for track in self._tracks if max(track.members) >= oldest]
 

@@ -185,11 +185,11 @@ class ScanFeed:
             self.contents |= content_digests(SequenceFiles(self.sequence), missing, writer, run=run)
         return combined(*(self.contents[frame] for frame in self.frames.tolist()))
 
-    def use(self, frames: list[int]) -> None:
-        """Merge only these frames of a growing sequence from now on."""
+    def use(self, sequence: Sequence, frames: list[int]) -> None:
+        """Read a sequence that has grown, and merge only these frames from now on."""
+        self.sequence, self.pose = sequence, cache(sequence.read_pose)
         self.is_growing, self.frames = True, np.array(frames, np.int64)
         self.times = {frame: self.time(frame) for frame in frames}
-        self.pose = cache(self.sequence.read_pose)
 
     @cached_property
     def frames(self) -> IntArray:
