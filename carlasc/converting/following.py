@@ -335,7 +335,7 @@ class _Drive:
             self._take(self._making.pop(0).result())
         if self._written > self._told and len(self._making) < _CALLS:
             self._told, path = self._written, sequence_path(self.plan.recording)
-            about = self._key, self.sink, path, self.plan.writer, self._grid, self._written
+            about = self._key, self.sink, path, self.plan.writer, self._grid
             self._making.append(self.maker.submit(make_provisional, *about))
 
     def _take(self, made: tuple[list[int], list[str]]) -> None:

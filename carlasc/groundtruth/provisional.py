@@ -7,8 +7,6 @@ grid: N is what the process has time for. Poses are not refined.
 
 from __future__ import annotations
 
-import math
-import time
 from dataclasses import replace
 from typing import cast
 
@@ -35,14 +33,11 @@ from carlasc.storage.resuming import check_grid
 _AFTER_S = 0.8  # scans up to so much later show what moves in a scan
 _AGAIN_S = 2.0  # tracks are estimated again after so much of the drive
 _KEPT = 80  # frames whose observations of actors are kept, at least
-_BEFORE = 40  # frames before a window, if the first call is in the middle of a drive
-# time for a scan and its grid: the first guess, and how many of the last ones are averaged
-_SPENT_S, _MEAN_OF = 0.3, 10
-_BEHIND = 15  # N grows by one with so many scans that wait
+_MOST, _EACH = 120, 4  # scans that may wait; N grows by one with so many of them
 
 
 def make_provisional(
-    key: str, sink: Sink, path: str, writer: SequenceWriter, plan: GridPlan, known: int
+    key: str, sink: Sink, path: str, writer: SequenceWriter, plan: GridPlan
 ) -> tuple[list[int], list[str]]:
     """Take the scans that were written since the last call, and make grids, marked as provisional.
 
@@ -52,7 +47,6 @@ def make_provisional(
         path: path of the sequence.
         writer: writes beside it.
         plan: the plan of the final grids.
-        known: number of frames whose poses are written.
 
     Returns:
         The frames that got a grid; and why scans or frames failed.
@@ -61,55 +55,43 @@ def make_provisional(
         StorageError: a grid cannot be written.
     """
     sequence = sink.source().sequences_in([place_of(path)])[path]
-    frames = [frame for frame in sequence.frames("points").tolist() if frame < known]
-    made, problems = list[int](), list[str]()
-    if len(frames) < 2:
-        return made, problems
     if key not in _DRIVES:
         _DRIVES.clear()
-        _DRIVES[key] = _GrowingDrive(sequence, plan, writer, frames)
-    drive = _DRIVES[key]
-    for frame in drive.choose(sequence, frames):
-        begun_s, is_first = time.monotonic(), not drive.is_begun
+        _DRIVES[key] = _GrowingDrive(sequence, plan, writer)
+    drive, made, problems = _DRIVES[key], list[int](), list[str]()
+    for frame in drive.choose(sequence):
         try:
             drive.take(frame)
             made += drive.make_grid()
         except (CarlascError, OSError) as error:
             problems.append(f"no grid of frame {frame} yet: {error}")
-        if not is_first:  # a whole window
-            drive.spent_s += (time.monotonic() - begun_s - drive.spent_s) / _MEAN_OF
     return made, problems
 
 
 class _GrowingDrive:
     """What is known of a drive: what moved in the last scans, and their free space."""
 
-    def __init__(
-        self, sequence: Sequence, plan: GridPlan, writer: SequenceWriter, frames: list[int]
-    ) -> None:
+    def __init__(self, sequence: Sequence, plan: GridPlan, writer: SequenceWriter) -> None:
         observe = cast(FromScans, plan.observe)
         self.plan, self.writer, (self.first, self.last) = plan, writer, observe.window
         if observe.motion.source != "none":
             observe = replace(observe, motion=replace(observe.motion, source="evidence"))
         self.feed = feed = ScanFeed(sequence, observe)
         feed.use(sequence, [])
-        # in the middle of a drive, the first grid has a whole window
-        self._next = max(frames[0], frames[-1] - self.last + self.first - _BEFORE)
-        self._unmade = self._next - min(self.first, 0) * (self._next > frames[0])
+        self._next, self._every, self._unmade = 0, 1, 0
         self._judged = list[int]()  # the frames whose moving points are known
         movable = feed.classes.movable if feed.trusts_ground_labels else ()
         self._evidence = EvidenceWindow(movable, after_s=_AFTER_S)
         self._follower = follower_of(feed)
         self._tracks, self._actors = list[Track](), MovingActors()
         self._tracked_s, self._numbered = -np.inf, 1
-        self.is_begun, self.spent_s, self._every = False, _SPENT_S, 1
 
-    def choose(self, sequence: Sequence, frames: list[int]) -> list[int]:
+    def choose(self, sequence: Sequence) -> list[int]:
         """Return the scans to take: every N-th one."""
         self.feed.use(sequence, self._judged)
-        new = [frame for frame in frames if frame >= self._next]
-        period_s = float(np.median(np.diff(sequence.times_of(frames[-_MEAN_OF:]))))
-        self._every = max(math.ceil(self.spent_s / max(period_s, 1e-3)), 1) + len(new) // _BEHIND
+        frames, known = sequence.frames("points").tolist(), len(sequence.poses)
+        new = [frame for frame in frames if self._next <= frame < known][-_MOST:]
+        self._every = 1 + len(new) // _EACH
         return new[:: self._every]
 
     def take(self, frame: int) -> None:
@@ -145,7 +127,7 @@ class _GrowingDrive:
         if not ready:
             return []
         number = ready[-1]
-        if not self.is_begun:
+        if not self._unmade:
             self._begin_grid(number)
         self._unmade = number + 1
         near = self._actors_now().between(number + self.first, number + self.last)
@@ -172,7 +154,6 @@ class _GrowingDrive:
             if existing is not None:
                 writer.remove_grid(plan.grid)
             writer.write_document(document, to_json(params))
-        self.is_begun = True
 
     def _track(self, actor: FoundActor) -> Track:
         return track_of(actor, self.feed.times, self.feed.classes.deformable)
@@ -182,8 +163,8 @@ class _GrowingDrive:
         now_s = self.feed.time(self._judged[-1])
         if now_s - self._tracked_s >= _AGAIN_S and self.feed.needs_actors:
             self._tracked_s = now_s
-            follower, living = self._follower.ended_now()
-            every = [*self._tracks, *map(self._track, living)]
+            follower = self._follower
+            every = [*self._tracks, *map(self._track, follower.finish())]
             every = [track for track in every if track.instance not in follower.riders]
             moving = untracked(follower.moved, [track for track in every if track.is_possible])
             actors = MovingActors.of(complete_bodies(every), moving, follower.own)
