@@ -201,7 +201,6 @@ def convert(
             poses=poses.make(),
             grids=made if grids == "scans" else None,
             options=options.values,
-            run=carlasc.Run(run.workers),
             say=lambda line: echo(line, err=True),
         )
     with run.spread(f"convert {name}", "steps") as spread:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, cast
+from uuid import uuid4
 
 import numpy as np
 
@@ -48,19 +49,19 @@ from carlasc.errors import (
     count,
     only,
 )
-from carlasc.groundtruth.inputs import GridPlan, without_caches
+from carlasc.groundtruth.inputs import GridPlan
 from carlasc.groundtruth.options import FromScans, GridOptions, Voting
-from carlasc.groundtruth.provisional import ProvisionalFrame
+from carlasc.groundtruth.provisional import make_provisional
 from carlasc.inspection.pose_quality import describe_jumps
 from carlasc.motion import odometry
 from carlasc.motion.options import PoseOptions
-from carlasc.running.processes import one_pool
+from carlasc.running.processes import own_processes
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout as files
 from carlasc.storage.files import AnyPath
 from carlasc.storage.folder import FolderSink
 from carlasc.storage.inputs import PROVISIONAL, MadeFrom
-from carlasc.storage.layout import Metadata, place_of
+from carlasc.storage.layout import Metadata
 from carlasc.storage.opening import as_sink
 from carlasc.storage.protocol import Sink, Source
 
@@ -68,6 +69,7 @@ _LOOK_S = 0.5  # between two looks at the folder
 _BATCH = 10  # scans that are written together, at most
 _PAUSE_S = 3.0  # a pause of the sensor that is noted
 _SAID_S = 10.0  # between two lines on the progress
+_CALLS = 2  # of a maker that wait for its result
 _AROUND = 20  # poses that give the motion during a scan
 
 
@@ -81,17 +83,16 @@ def follow(
     poses: PoseOptions = PoseOptions(),  # noqa: B008 (frozen)
     grids: GridOptions | None = GridOptions(),  # noqa: B008 (frozen)
     options: Mapping[str, Any] | None = None,
-    run: Run = Run(),  # noqa: B008 (frozen)
     say: Callable[[str], None] = lambda line: None,
     wait: Callable[[float], None] = time.sleep,
 ) -> None:
     """Convert the scans of a growing folder as they appear, until no scan comes any more or Ctrl-C.
 
     A scan is taken when its size did not change between two looks. Its pose is estimated from the
-    scans before it, whatever poses the recording has. One process takes scans, and the others make
-    the grid of the newest frame whose window is complete, again and again: the faster they are, the
-    more frames get one. All of this is marked as provisional, and `convert` with the same arguments
-    replaces it: its result does not depend on what was made here.
+    scans before it, whatever poses the recording has. This process takes scans, and another one
+    makes grids of frames whose windows are complete: of as many as it has time for. All of this is
+    marked as provisional, and `convert` with the same arguments replaces it: its result does not
+    depend on what was made here.
 
     Args:
         name: the converter, of a data set with one recording: "scans".
@@ -102,7 +103,6 @@ def follow(
         poses: how poses are estimated.
         grids: the grids; None makes none.
         options: options of the converter, by name.
-        run: number of processes.
         say: called with what happens, one line each.
         wait: waits for some seconds, between two looks at the folder.
 
@@ -123,13 +123,9 @@ def follow(
     poses, layout = replace(poses, source="kiss-icp"), replace(layout, boxes=None)
     converter = open_converter(name, root, options)
     look = _Folder(converter, idle_s, say, wait)
-    spread = Run(max(2, run.processes))  # one process makes grids, even on one core
-    with one_pool(spread) as pool:
-        makers = cast(Executor, pool.executor)
+    with own_processes(1) as maker:
         documents = describe(converter, name, layout)
-        drive = _Drive(
-            look, converter, sink, layout, documents, poses, grids, makers, spread.processes - 1
-        )
+        drive = _Drive(look, converter, sink, layout, documents, poses, grids, maker)
         try:
             drive.run()
         except KeyboardInterrupt:
@@ -203,9 +199,8 @@ class _Drive:
         metadata: the entries of carlasc.json that do not depend on scans.
         poses: how poses are estimated.
         grids: the grids; None makes none.
-        pool: processes that make grids.
-        makers: number of grids that are made at the same time.
-        arrived: time of the file of each scan, by frame number.
+        maker: a process that makes grids.
+        arrived: time of the file of each scan, or of the start after it, by frame number.
         lines: pose of each scan, first_T_scan, as far as they are estimated.
     """
 
@@ -216,16 +211,17 @@ class _Drive:
     metadata: Metadata
     poses: PoseOptions
     grids: GridOptions | None
-    pool: Executor
-    makers: int
+    maker: Executor
     arrived: list[float] = field(default_factory=list)
     lines: list[Transform] = field(default_factory=list)
     _waiting: dict[int, tuple[FrameHandle, Assembled]] = field(default_factory=dict)
     _written: int = 0
     _grid: GridPlan | None = None
-    _making: dict[int, Future[str | None]] = field(default_factory=dict)
+    _making: list[Future[tuple[list[int], list[str]]]] = field(default_factory=list)
     _made: list[int] = field(default_factory=list)
-    _next: int = 0
+    _told: int = 0
+    _begun_s: float = field(default_factory=time.time)
+    _key: str = field(default_factory=lambda: uuid4().hex)
     _said: float = 0.0
 
     def run(self) -> None:
@@ -253,7 +249,7 @@ class _Drive:
                 self._begin()
             at_s = number * files.FRAME_PERIOD_S if seconds is None else seconds
             self.plan.times = np.append(self.plan.times, at_s)
-            self.arrived.append(_state(handle.location)[1] / 1e9)
+            self.arrived.append(max(_state(handle.location)[1] / 1e9, self._begun_s))
             try:
                 scan = read_scan(handle, self.plan.rig, None)
             except (CarlascError, OSError) as error:
@@ -330,24 +326,27 @@ class _Drive:
         return VehicleMotion(Trajectory(vehicle, times), float(self.plan.times[number]))
 
     def _make_grids(self, grids: GridOptions) -> None:
-        """Take grids that are made, and begin that of the newest frame with a whole window."""
-        observe = grids.observe if isinstance(grids.observe, FromScans) else FromScans()
-        for number in [number for number, making in self._making.items() if making.done()]:
-            if error := self._making.pop(number).result():
-                self.folder.say(f"no grid of frame {number} yet: {error}")
-            else:
-                self._made.append(number)
-                self._report(number + observe.window[1])
-        number = self._written - 1 - observe.window[1]
-        if number < self._next or len(self._making) >= self.makers:
-            return
-        path, source = sequence_path(self.plan.recording), self.sink.source()
-        sequence = source.sequences_in([place_of(path)])[path]
+        """Take grids that are made, and tell the maker of new scans: it has one call to work on,
+        and one more to go on with.
+        """
         if self._grid is None:
-            self._grid = self._plan(grids, source)
-        self._next = number + 1
-        frame = ProvisionalFrame(without_caches(sequence), self.plan.writer, self._grid, number)
-        self._making[number] = self.pool.submit(ProvisionalFrame.make, frame)
+            self._grid = self._plan(grids, self.sink.source())
+        while self._making and self._making[0].done():
+            self._take(self._making.pop(0).result())
+        if self._written > self._told and len(self._making) < _CALLS:
+            self._told, path = self._written, sequence_path(self.plan.recording)
+            about = self._key, self.sink, path, self.plan.writer, self._grid
+            self._making.append(self.maker.submit(make_provisional, *about))
+
+    def _take(self, made: tuple[list[int], list[str]]) -> None:
+        """Note what the maker made."""
+        numbers, problems = made
+        for problem in problems:
+            self.folder.say(problem)
+        self._made += numbers
+        if numbers and self._grid is not None:
+            observe = cast(FromScans, self._grid.observe)
+            self._report(numbers[-1] + observe.window[1])
 
     def _plan(self, grids: GridOptions, source: Source) -> GridPlan:
         """Return the plan of the grids, by the ground and the reach of the scans so far."""
@@ -383,10 +382,14 @@ class _Drive:
         )
 
     def finish(self) -> None:
-        """Wait for the grids that are being made, and say what there is."""
-        for making in self._making.values():
-            making.exception()
-        made = len(self._made) + len(self._making)
+        """Wait for the grids that are being made, then for those of the last scans; say what there
+        is.
+        """
+        for _ in range(2):
+            while self._making:
+                self._take(self._making.pop(0).result())
+            self.write()
+        made = len(self._made)
         self.folder.say(
             f"the drive has {count(len(self.arrived), 'scan')}; "
             f"{count(made, 'provisional grid')} were made"

@@ -1,79 +1,178 @@
-"""Grids of a drive that still grows: from the poses and the scans known so far."""
+"""Grids of a drive that still grows: from the poses and the scans known so far.
+
+One process makes them. It keeps what it knows of the drive, so each scan is read and searched for
+motion once, and each of its rays is followed once. Every N-th scan is merged, and its frame gets a
+grid: N is what the process has time for. Poses are not refined.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import cast
 
+import numpy as np
+
 from carlasc.errors import CarlascError
-from carlasc.groundtruth.from_scans.feed import WithoutScans
-from carlasc.groundtruth.from_scans.sequences import ScanSequence
+from carlasc.groundtruth.from_scans.feed import ScanFeed
+from carlasc.groundtruth.from_scans.motion_pass import follower_of, track_of, untracked
+from carlasc.groundtruth.from_scans.sequences import ScanFrame, ScanSequence, ScanWindow
 from carlasc.groundtruth.inputs import GridPlan
 from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.run import FrameTask, settings_of
-from carlasc.running.spreading import Run
+from carlasc.motion import Track, complete_bodies
+from carlasc.motion.evidence import EvidenceWindow
+from carlasc.motion.found_actors import FoundActor
+from carlasc.motion.tracks import MovingActors
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
 from carlasc.storage.inputs import PROVISIONAL, MadeFrom
-from carlasc.storage.protocol import Sequence, SequenceWriter
+from carlasc.storage.layout import place_of
+from carlasc.storage.protocol import Sequence, SequenceWriter, Sink
 from carlasc.storage.resuming import check_grid
 
-_EVERY = 3  # of the scans of a window, every N-th one is merged: to find what moves takes time
+_AFTER_S = 0.8  # scans up to so much later show what moves in a scan
+_AGAIN_S = 2.0  # tracks are estimated again after so much of the drive
+_KEPT = 80  # frames whose observations of actors are kept, at least
+_MOST, _EACH = 120, 4  # scans that may wait; N grows by one with so many of them
 
 
-@dataclass(frozen=True)
-class ProvisionalFrame:
-    """A frame of which the whole window exists. It is made in a worker.
+def make_provisional(
+    key: str, sink: Sink, path: str, writer: SequenceWriter, plan: GridPlan
+) -> tuple[list[int], list[str]]:
+    """Take the scans that were written since the last call, and make grids, marked as provisional.
 
-    Every third scan of its window is merged, and shows what moves; poses are not refined. So each
-    grid takes the same short time, however long the drive is.
-
-    Attributes:
-        sequence: its sequence.
+    Args:
+        key: of the drive: other calls with it in the same process continue each other.
+        sink: the output.
+        path: path of the sequence.
         writer: writes beside it.
         plan: the plan of the final grids.
-        number: number of the frame.
+
+    Returns:
+        The frames that got a grid; and why scans or frames failed.
+
+    Raises:
+        StorageError: a grid cannot be written.
     """
+    sequence = sink.source().sequences_in([place_of(path)])[path]
+    if key not in _DRIVES:
+        _DRIVES.clear()
+        _DRIVES[key] = _GrowingDrive(sequence, plan, writer)
+    drive, made, problems = _DRIVES[key], list[int](), list[str]()
+    for frame in drive.choose(sequence):
+        try:
+            drive.take(frame)
+            made += drive.make_grid()
+        except (CarlascError, OSError) as error:
+            problems.append(f"no grid of frame {frame} yet: {error}")
+    return made, problems
 
-    sequence: Sequence
-    writer: SequenceWriter
-    plan: GridPlan
-    number: int
 
-    def make(self) -> str | None:
-        """Make and write the grid of the frame, marked as provisional; return why it failed.
+class _GrowingDrive:
+    """What is known of a drive: what moved in the last scans, and their free space."""
+
+    def __init__(self, sequence: Sequence, plan: GridPlan, writer: SequenceWriter) -> None:
+        observe = cast(FromScans, plan.observe)
+        self.plan, self.writer, (self.first, self.last) = plan, writer, observe.window
+        if observe.motion.source != "none":
+            observe = replace(observe, motion=replace(observe.motion, source="evidence"))
+        self.feed = feed = ScanFeed(sequence, observe)
+        feed.use(sequence, [])
+        self._next, self._every, self._unmade = 0, 1, 0
+        self._judged = list[int]()  # the frames whose moving points are known
+        movable = feed.classes.movable if feed.trusts_ground_labels else ()
+        self._evidence = EvidenceWindow(movable, after_s=_AFTER_S)
+        self._follower = follower_of(feed)
+        self._tracks, self._actors = list[Track](), MovingActors()
+        self._tracked_s, self._numbered = -np.inf, 1
+
+    def choose(self, sequence: Sequence) -> list[int]:
+        """Return the scans to take: every N-th one."""
+        self.feed.use(sequence, self._judged)
+        frames, known = sequence.frames("points").tolist(), len(sequence.poses)
+        new = [frame for frame in frames if self._next <= frame < known][-_MOST:]
+        self._every = 1 + len(new) // _EACH
+        return new[:: self._every]
+
+    def take(self, frame: int) -> None:
+        """Take a scan, and find what moved in the scans before it.
 
         Raises:
-            StorageError: the grid cannot be written.
+            FormatError: it is not valid.
         """
-        observe = cast(FromScans, self.plan.observe)
-        first, last = observe.window
-        every = observe.stride if observe.stride > 1 else _EVERY
-        others = set(self.sequence.frames("points").tolist())
-        others -= {self.number + i for i in range(first, last + 1) if i % every == 0}
-        near, plan, writer = WithoutScans(self.sequence, others), self.plan, self.writer
-        try:
-            params = settings_of(ScanSequence(near, plan, observe), plan)
-            check_grid(writer, plan.grid, params, [self.number], overwrite=True)
-            self._mark(to_json(params))
-            unrefined = replace(observe.poses, refine="never")
-            inputs = ScanSequence(near, plan, replace(observe, poses=unrefined))
-            inputs.prepare(None, Run(workers=1), lambda steps: None)
-            frame = inputs.frame(self.number)
-            made = FrameTask(self.number, frame, plan, inputs.metadata.classes, False).run()
-        except (CarlascError, OSError) as error:
-            return str(error)
-        grid = f"{plan.grid}/"
-        fields = {name: data for name, data in made.outputs.items() if name.startswith(grid)}
-        if fields:
-            writer.write_frames({self.number: fields})
-        return made.error
+        self._next = frame + self._every
+        if not self.feed.needs_actors:
+            self._judge(frame)
+            return
+        for found in self._evidence.add(self.feed.evidence_scan(frame, ())):
+            self._judge(found.frame)
+            self._tracks += map(self._track, self._follower.add(found.thinned()))
 
-    def _mark(self, params: bytes) -> None:
-        """Note that the grid is provisional; remove frames with other settings."""
-        name, document = f"made-{self.plan.grid}", layout.params_file(self.plan.grid)
-        MadeFrom(PROVISIONAL).write(self.writer, name)
-        if (existing := self.writer.read_document(document)) != params:
+    def _judge(self, frame: int) -> None:
+        """Merge a frame from now on, and forget old ones."""
+        oldest = frame - max(self.last - self.first, _KEPT)
+        self._judged = [one for one in [*self._judged, frame] if one >= oldest]
+        self.feed.use(self.feed.sequence, self._judged)
+        self._follower.forget_before(oldest)
+        self._tracks = [track for track in self._tracks if max(track.members) >= oldest]
+
+    def make_grid(self) -> list[int]:
+        """Make and write the grid of the newest frame whose window is complete, unless it is
+        made; return its number, if it has one.
+
+        Raises:
+            CarlascError: it cannot be made.
+        """
+        ready = [f for f in self._judged if self._unmade <= f <= self._judged[-1] - self.last]
+        if not ready:
+            return []
+        number = ready[-1]
+        if not self._unmade:
+            self._begin_grid(number)
+        self._unmade = number + 1
+        near = self._actors_now().between(number + self.first, number + self.last)
+        frame = ScanFrame(ScanWindow(self.feed, near), number, number)
+        made = FrameTask(number, frame, self.plan, self.feed.classes, False).run()
+        if made.error:
+            raise CarlascError(self.feed.sequence.location, problem=made.error)
+        fields = {n: data for n, data in made.outputs.items() if n.startswith(f"{self.plan.grid}/")}
+        self.writer.write_frames({number: fields})
+        return [number]
+
+    def _begin_grid(self, number: int) -> None:
+        """Note that grids are provisional; remove frames with other settings.
+
+        Raises:
+            ConflictError: the grid is not one of carlasc's.
+        """
+        plan, writer, document = self.plan, self.writer, layout.params_file(self.plan.grid)
+        inputs = ScanSequence(self.feed.sequence, plan, cast(FromScans, plan.observe))
+        params = settings_of(inputs, plan)
+        check_grid(writer, plan.grid, params, [number], overwrite=True)
+        MadeFrom(PROVISIONAL).write(writer, f"made-{plan.grid}")
+        if (existing := writer.read_document(document)) != to_json(params):
             if existing is not None:
-                self.writer.remove_grid(self.plan.grid)
-            self.writer.write_document(document, params)
+                writer.remove_grid(plan.grid)
+            writer.write_document(document, to_json(params))
+
+    def _track(self, actor: FoundActor) -> Track:
+        return track_of(actor, self.feed.times, self.feed.classes.deformable)
+
+    def _actors_now(self) -> MovingActors:
+        """Return the moving actors; their tracks are at most `_AGAIN_S` old."""
+        now_s = self.feed.time(self._judged[-1])
+        if now_s - self._tracked_s >= _AGAIN_S and self.feed.needs_actors:
+            self._tracked_s = now_s
+            follower = self._follower
+            every = [*self._tracks, *map(self._track, follower.finish())]
+            every = [track for track in every if track.instance not in follower.riders]
+            moving = untracked(follower.moved, [track for track in every if track.is_possible])
+            actors = MovingActors.of(complete_bodies(every), moving, follower.own)
+            # what was kept of an actor is not of this track of it: each gets a new number
+            numbered = {self._numbered + n: track for n, track in actors.tracks.items()}
+            self._numbered += len(every)
+            self._actors = replace(actors, tracks=numbered, numbers={n: n for n in numbered})
+        return replace(self._actors, moving={**self._follower.moved, **self._actors.moving})
+
+
+_DRIVES: dict[str, _GrowingDrive] = {}  # the drive of this process, by its key

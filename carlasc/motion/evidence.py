@@ -167,6 +167,52 @@ def views_of(scan: EvidenceScan) -> tuple[SortedReturns, ...]:
     )
 
 
+class EvidenceWindow:
+    """The scans among which evidence is searched for: those within the `HORIZON_S` of a scan, so
+    memory does not grow with the drive.
+
+    Args:
+        movable: classes of actors. Points of different movable classes are not grouped together.
+        frames: only the evidence of these frames is found; None: of all.
+        after_s: scans up to so much later are waited for.
+    """
+
+    def __init__(
+        self,
+        movable: Collection[int] = (),
+        frames: Collection[int] | None = None,
+        after_s: float = HORIZON_S,
+    ) -> None:
+        self._movable, self._frames, self._after_s = movable, frames, after_s
+        self._window: deque[_Kept] = deque()
+        self._current, self._last = 0, -np.inf
+
+    def add(self, scan: EvidenceScan) -> Iterator[FreeSpaceEvidence]:
+        """Add the next scan, and yield the evidence of those that waited for it."""
+        window, last, seconds = self._window, self._last, scan.seconds
+        if not seconds > last:
+            seconds = last + _PERIOD_S if np.isfinite(last) else 0.0
+        self._last = seconds
+        # Invariant: `window` holds the scans within the horizon of the current one, which is the
+        # first whose evidence is not given yet.
+        window.append(_Kept(scan, seconds, views_of(scan)))
+        while seconds - window[self._current].seconds > self._after_s:
+            yield from self._found(self._current)
+            self._current += 1
+            while window[self._current].seconds - window[0].seconds > HORIZON_S:
+                window.popleft()
+                self._current -= 1
+
+    def finish(self) -> Iterator[FreeSpaceEvidence]:
+        """Yield the evidence of the scans that still wait."""
+        for index in range(self._current, len(self._window)):
+            yield from self._found(index)
+
+    def _found(self, index: int) -> Iterator[FreeSpaceEvidence]:
+        if self._frames is None or self._window[index].scan.frame in self._frames:
+            yield _evidence(self._window, index, self._movable)
+
+
 def find_evidence(
     scans: Iterable[EvidenceScan],
     *,
@@ -176,42 +222,19 @@ def find_evidence(
     """Yield the evidence of each scan of a drive, when the scans of the `HORIZON_S` after it were
     read.
 
-    Only scans within this time are held, so memory does not grow with the drive.
-
     Args:
         scans: the scans in order of time. Times that do not increase are replaced by 0.1 s per
             scan.
-        movable: classes of actors. Points of different movable classes are not grouped together.
-        frames: only the evidence of these frames is found; None: of all.
+        movable: as in `EvidenceWindow`.
+        frames: as there.
 
     Yields:
         The evidence of each of these scans, in their order.
     """
-    window: deque[_Kept] = deque()
-    current, last = 0, -np.inf
-
-    def found(index: int) -> Iterator[FreeSpaceEvidence]:
-        if frames is None or window[index].scan.frame in frames:
-            yield _evidence(window, index, movable)
-
+    window = EvidenceWindow(movable, frames)
     for scan in scans:
-        seconds = (
-            scan.seconds
-            if scan.seconds > last
-            else (last + _PERIOD_S if np.isfinite(last) else 0.0)
-        )
-        last = seconds
-        # Invariant: `window` holds the scans within the horizon of the current one, which is the
-        # first whose evidence is not given yet. It is complete when a scan lies beyond its horizon.
-        window.append(_Kept(scan, seconds, views_of(scan)))
-        while window[-1].seconds - window[current].seconds > HORIZON_S:
-            yield from found(current)
-            current += 1
-            while window[current].seconds - window[0].seconds > HORIZON_S:
-                window.popleft()
-                current -= 1
-    for index in range(current, len(window)):
-        yield from found(index)
+        yield from window.add(scan)
+    yield from window.finish()
 
 
 def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> FreeSpaceEvidence:

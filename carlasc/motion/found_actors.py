@@ -60,6 +60,7 @@ _LINE_SLOPE = 0.004  # a quarter of a degree: the points of one scan line differ
 # Parts of the recording vehicle: cells around the sensor in which nearly all scans have points,
 # often at places that were free at other times; and cells beside them with such points.
 _ALWAYS, _FREED, _OFTEN = 0.95, 0.3, 0.3
+_BESIDE = 500  # actors that are remembered, while scans come
 _BESIDE_M = 1.8  # farther beside the way of the sensor, another vehicle may drive along
 # What stands on the ground beside the sensor is a rider or a person, who keeps its pace: so near
 # above the ground, and so high and not longer. So is what is so high and shifts by so much beside
@@ -164,7 +165,9 @@ class ActorFollower:
         return actors
 
     def finish(self) -> list[FoundActor]:
-        """Return the actors that have not ended, and find the parts of the recording vehicle."""
+        """Return the actors that have not ended, and find the parts of the recording vehicle. More
+        scans may come: they continue these actors under other numbers.
+        """
         actors = self._actors(self._alive)
         own = self._own_cells()
         beside = np.zeros_like(own)
@@ -183,6 +186,18 @@ class ActorFollower:
             if wide[cells].all():  # found by their place
                 self.moved[frame] = np.setdiff1d(self.moved[frame], members)
         return [actor for actor in actors if actor.segments[0].instance not in self.riders]
+
+    def forget_before(self, frame: int) -> None:
+        """Forget observations before a frame, but not those of how the last scans move."""
+        self.moved = {scan: moved for scan, moved in self.moved.items() if scan >= frame}
+        self._close = [close for close in self._close if close[0] >= frame]
+        del self._beside[:-_BESIDE]
+        self._cells = {n: cells for n, cells in self._cells.items() if n >= self._number - _BESIDE}
+        for one in self._alive:
+            one.links = [
+                *(link for link in one.links[:-_HISTORY] if link.segment.frame >= frame),
+                *one.links[-_HISTORY:],
+            ]
 
     def _own_cells(self) -> BoolArray:
         """Return the cells of the recording vehicle, as a cube: what stays at one place of the

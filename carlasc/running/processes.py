@@ -62,7 +62,7 @@ def run_all(
     if isinstance(executor, LazyClient):
         executor = executor.client
     if executor is None and workers > 1 and not is_one:
-        with _own_processes(workers) as pool:
+        with own_processes(workers) as pool:
             yield from _submit_all(pool, function, items, 2 * workers, lost)
     elif executor is None or (isinstance(executor, OwnProcesses) and is_one):
         yield from map(function, items)
@@ -130,12 +130,12 @@ def one_pool(run: Run) -> Iterator[Run]:
     if run.executor is not None or run.is_alone:
         yield run
     else:
-        with _own_processes(run.processes) as pool:
+        with own_processes(run.processes) as pool:
             yield replace(run, executor=pool)
 
 
 @contextmanager
-def _own_processes(workers: int) -> Iterator[Executor]:
+def own_processes(workers: int) -> Iterator[Executor]:
     """Yield an executor whose processes end with the block, immediately if the block fails or is
     interrupted.
     """

@@ -4,6 +4,7 @@ output has the bytes of a run on the finished drive.
 
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,9 +16,15 @@ import carlasc
 from carlasc import FromScans, GridSpec, Run
 from carlasc.cli import app
 from carlasc.converting import LayoutOptions, convert, follow
+from carlasc.core.frames import FrameRange
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError
 from carlasc.groundtruth import GridOptions
+from carlasc.groundtruth.inputs import GridPlan
+from carlasc.groundtruth.options import Voting
+from carlasc.groundtruth.provisional import make_provisional
 from carlasc.inspection.staleness import changed_inputs
+from carlasc.storage.layout import grid_folder
+from carlasc.storage.opening import as_sink
 from carlasc.testing import SimulatedDrive
 
 pytestmark = pytest.mark.needs("kiss_icp")
@@ -51,7 +58,7 @@ class Feed:
 
     def follow(self, out: Path, **options) -> None:
         self.folder.mkdir(exist_ok=True)
-        settings = {"idle_s": 4, "grids": None, "run": Run(2), "wait": self.wait}
+        settings = {"idle_s": 4, "grids": None, "wait": self.wait}
         follow("scans", self.folder, out, say=self.said.append, **settings | options)
 
     def has_said(self, text: str) -> bool:
@@ -108,12 +115,41 @@ def test_grids_are_provisional_until_the_drive_ends(tmp_path):
     (sequence,) = carlasc.open(out).values()
     (grid,) = sequence.grids
     made = sequence.frames(f"{grid}/labels")
-    assert len(made) and made[-1] < 15
+    assert len(made) and made[-1] < 15 and not feed.has_said("no grid")
     assert "provisional" in changed_inputs(sequence, grid)
     check_final(feed, out, grids=GRIDS)
     (sequence,) = carlasc.open(out).values()
     assert len(sequence.frames(f"{grid}/labels")) == 18
     assert not changed_inputs(sequence, grid)
+
+
+@pytest.mark.slow
+def test_grids_follow_the_scans(tmp_path):
+    """A call goes on where the last one ended, and reads poses that came since."""
+    feed, sink = Feed(tmp_path / "scans", 0), as_sink(tmp_path / "out")
+    grid = grid_folder(SPEC)
+    plan, numbers = GridPlan(SPEC, grid, GRIDS.observe, Voting(), FrameRange()), list[int]()
+    for known in (12, 24, 36):
+        feed.frames = known
+        feed.follow(tmp_path / "out")
+        (path,) = sink.source().sequences()
+        made, problems = make_provisional("a drive", sink, path, sink.sequence(path), plan)
+        numbers += made
+        assert not problems and all(number + 3 < known for number in made)
+    (sequence,) = sink.source().sequences().values()
+    assert numbers == sequence.frames(f"{grid}/labels").tolist() == sorted(set(numbers))
+    assert len(numbers) >= 3 and numbers[-1] > 12
+    # what the last scans show of a street is what all of them show
+    convert(
+        "scans",
+        feed.folder,
+        tmp_path / "fresh",
+        grids=replace(GRIDS, follow_ground=False),
+        run=Run(1),
+    )
+    (final,) = carlasc.open(tmp_path / "fresh").values()
+    one, other = (s.read(f"{grid}/labels", numbers[-1]) > 0 for s in (sequence, final))
+    assert (one & other).sum() > 0.8 * (one | other).sum()
 
 
 @pytest.mark.slow

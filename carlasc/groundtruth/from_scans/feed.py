@@ -133,7 +133,10 @@ class ScanFeed:
         key: the same for all copies of a feed.
         contents: digest of each scan that was compared.
         pose: returns (4, 4) first_T_sensor of a frame.
+        is_growing: whether more scans come: see `use`.
     """
+
+    is_growing = False
 
     def __init__(self, sequence: Sequence, options: FromScans) -> None:
         self.sequence, self.options = sequence, options
@@ -181,6 +184,12 @@ class ScanFeed:
         if missing := [frame for frame in self.frames.tolist() if frame not in self.contents]:
             self.contents |= content_digests(SequenceFiles(self.sequence), missing, writer, run=run)
         return combined(*(self.contents[frame] for frame in self.frames.tolist()))
+
+    def use(self, sequence: Sequence, frames: list[int]) -> None:
+        """Read a sequence that has grown, and merge only these frames from now on."""
+        self.sequence, self.pose = sequence, cache(sequence.read_pose)
+        self.is_growing, self.frames = True, np.array(frames, np.int64)
+        self.times = {frame: self.time(frame) for frame in frames}
 
     @cached_property
     def frames(self) -> IntArray:
@@ -352,6 +361,8 @@ class ScanFeed:
             return transform_points(self.pose(frame), corners)
 
         def cast_of(frame: int, within_s: float) -> Cast:
+            if self.is_growing:  # the grids of later frames are not known
+                return self.read(frame).cast(map_T_world, np.full(3, -np.inf), np.full(3, np.inf))
             # of all frames, made or not: counts do not depend on which frames are made
             near = self.frames[(self.frames >= frame - last) & (self.frames <= frame - first)]
             grids = [

@@ -89,7 +89,7 @@ def _find_evidence(*args: Any, **options: Any) -> list[FreeSpaceEvidence]:
     return list(_evidence_of(*args, **options))
 
 
-def _make_track(actor: FoundActor, times: dict[int, float], deformable: frozenset[int]) -> Track:
+def track_of(actor: FoundActor, times: dict[int, float], deformable: frozenset[int]) -> Track:
     """Estimate the track of one actor, in a worker."""
     chain, rigid, sure, path = actor
     return make_track(chain, times, deformable=deformable, rigid=rigid, confidence=sure, path=path)
@@ -129,16 +129,12 @@ def find_actors(
     tracks = _boxed(feed, run, steps, boxes, moving_boxes) if boxes else _linked(feed, run, steps)
     if "evidence" not in feed.motion:
         return MovingActors.of(tracks if boxes else complete_bodies(tracks))
-    frames, classes = list(feed.times), feed.classes
+    frames = list(feed.times)
     # A block reads the seconds around it too: longer blocks repeat less, and shorter ones keep all
     # processes busy.
     size = min(max(-(-len(frames) // run.processes), _BLOCK[0]), _BLOCK[1])
     blocks = [tuple(frames[begin : begin + size]) for begin in range(0, len(frames), size)]
-    follower = ActorFollower(
-        deformable=classes.deformable,
-        first_instance=FIRST_FOUND,
-        default_label=0 if feed.has_labels else classes.geometry_id,
-    )
+    follower = follower_of(feed)
     found, waiting = list[Track](), list[FoundActor]()
     # This process gives each scan as soon as it can, so that progress moves.
     is_here = run.executor is None and (run.processes == 1 or len(blocks) == 1)
@@ -154,9 +150,18 @@ def find_actors(
     found = [track for track in found if track.instance not in follower.riders]
     tracks += found
     # points of what is too large for one actor moved, but not together
-    moving = _untracked(follower.moved, [track for track in found if track.is_possible])
+    moving = untracked(follower.moved, [track for track in found if track.is_possible])
     tracks = tracks if boxes else complete_bodies(tracks)
     return MovingActors.of(tracks, moving, follower.own, follower.seen)
+
+
+def follower_of(feed: ScanFeed) -> ActorFollower:
+    """Return what follows the actors that the evidence of a sequence shows."""
+    return ActorFollower(
+        deformable=feed.classes.deformable,
+        first_instance=FIRST_FOUND,
+        default_label=0 if feed.has_labels else feed.classes.geometry_id,
+    )
 
 
 def _linked(feed: ScanFeed, run: Run, steps: Callable[[int], None]) -> list[Track]:
@@ -203,12 +208,12 @@ def _boxed(
 
 def _estimate(feed: ScanFeed, run: Run, actors: Iterable[FoundActor]) -> list[Track]:
     """Return the tracks of actors."""
-    make = partial(_make_track, times=feed.times, deformable=feed.classes.deformable)
+    make = partial(track_of, times=feed.times, deformable=feed.classes.deformable)
     with _each(make, actors, run) as tracks:
         return list(tracks)
 
 
-def _untracked(moved: dict[int, Int32Array], tracks: list[Track]) -> dict[int, AnyIntArray]:
+def untracked(moved: dict[int, Int32Array], tracks: list[Track]) -> dict[int, AnyIntArray]:
     """Return the moved points of each frame that belong to no track."""
     tracked: dict[int, list[AnyIntArray]] = {}
     for track in tracks:
