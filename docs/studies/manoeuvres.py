@@ -2,16 +2,16 @@
 
 `python docs/studies/manoeuvres.py [WORK]` prints a table: what is found of each kind of vehicle of
 `manoeuvring.py`, by flow and without any hint. A LiDAR of 32 channels records while everything
-moves; `--instant` sees all at one instant. WORK keeps the drives. All constants were chosen on seeds
-401 to 405.
+moves; with `--instant`, it sees all at one instant. WORK keeps the drives. All constants were
+chosen on seeds 401 to 405.
 
 | column | meaning |
 |---|---|
 | found | share of the moving points within 25 m that belong to an actor that was found |
 | actors | found actors that hold a tenth of its points or more, per vehicle |
-| heading | error of the actor that holds most of its points, degrees: median, 90% quantile |
+| heading | error of the actor that holds most of its points, degrees: median, 90% quantile; tractor and trailer, and the two parts of a bus, count each |
 | reversed | share of the scans in which its heading is wrong by more than 90 degrees |
-| IoU | of its box and the true one, seen from above: median, share of at least 0.5 |
+| IoU | of found and true boxes, seen from above: median, share of at least 0.5 |
 | trail | occupied share of the empty voxels of 0.2 m that it passed at other times |
 """
 
@@ -28,8 +28,9 @@ from carlasc_recorders.town.actors import EGO_ID
 from manoeuvring import ManoeuvreDrive, Vehicle
 from movers_drives import Recorded, Setting, record_all
 from movers_rows import EVIDENCE, FLOW
+from numpy.typing import NDArray
 
-from carlasc.core.geometry import invert
+from carlasc.core.geometry import Transform, invert, rotation_z, transform_points, translation
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
 from carlasc.motion import BODY_MARGIN_M
@@ -41,6 +42,9 @@ FRAMES = (30, 45, 60)  # whose trails are measured
 _MOVES_M_S = 1.0  # a vehicle is judged in scans in which it moves faster, or did so before
 _POINTS = 30  # least number of points in a scan
 _PART = 0.1  # of a vehicle's points, that an actor holds
+
+Rectangle = tuple[Transform, NDArray[np.float64]]
+"""Pose, and length and width, metres."""
 
 
 @dataclass
@@ -87,12 +91,11 @@ class Scores:
 
 
 def judge(drive: Recorded, actors: MovingActors, square: ManoeuvreDrive) -> dict[str, Scores]:
-    """Compare found actors with the vehicles of the square."""
+    """Compare found actors with the vehicles of the square; what one draws belongs to it."""
     vehicles = {EGO_ID + k: vehicle for k, vehicle in enumerate(square.manoeuvres.movers)}
     scores = {vehicle.name: Scores() for vehicle in vehicles.values()}
-    held = {number: Counter[int]() for number in vehicles}
-    sequence, began = drive.sequence, set[int]()
-    sequence_T_world = invert(square.sensor_poses(0, 1)[0])
+    held, began = {number: Counter[int]() for number in vehicles}, set[int]()
+    sequence, sequence_T_world = drive.sequence, invert(square.sensor_poses(0, 1)[0])
     for frame in sequence.frames("points").tolist():
         points = sequence.read("points", frame)[:, :3]
         owner = sequence.read("instances", frame).astype(np.int64)
@@ -101,34 +104,78 @@ def judge(drive: Recorded, actors: MovingActors, square: ManoeuvreDrive) -> dict
         track_of = np.full(len(points), -1)
         for number, track in actors.tracks.items():
             track_of[track.members.get(frame, [])] = number
-        for number in np.unique(owner[near & (owner > 0)]).tolist():
-            own = near & (owner == number)
-            one, vehicle = scores[vehicles[number].name], vehicles[number]
+        for number, parts in groups(vehicles).items():
+            own = near & np.isin(owner, parts)
+            if not own.any():
+                continue
+            one, tracked = scores[vehicles[number].name], track_of[own]
             if speed[own].max() > _MOVES_M_S:
                 began.add(number)
-                one.points += int(own.sum())
-                one.found += int((track_of[own] >= 0).sum())
-            if number not in began or own.sum() < _POINTS:
+                one.points += len(tracked)
+                one.found += int((tracked >= 0).sum())
+            if number not in began or len(tracked) < _POINTS:
                 continue
-            of_track = Counter(track_of[own][track_of[own] >= 0].tolist())
+            of_track = Counter(tracked[tracked >= 0].tolist())
             held[number].update(of_track)
-            if not of_track:
-                one.overlaps.append(0.0)
-                continue
-            track = actors.tracks[of_track.most_common(1)[0][0]]
-            pose, true = track.pose(frame), sequence_T_world @ vehicle.pose(frame)
-            assert pose is not None
-            turn = (invert(true) @ pose)[:2, 0]
-            one.headings.append(abs(float(np.arctan2(turn[1], turn[0]))))
-            size = np.array([vehicle.kind.length_m, vehicle.kind.width_m, 1.0])
-            one.overlaps.append(
-                study.overlap_above(pose, true, track.size - 2 * BODY_MARGIN_M, size)
-            )
-    for number, counts in held.items():
-        if number in began:
-            parts = [count for count in counts.values() if count > _PART * counts.total()]
-            scores[vehicles[number].name].actors.append(len(parts))
+            true = [
+                (sequence_T_world @ vehicles[part].pose(frame), size_of(vehicles[part]))
+                for part in parts
+            ]
+            found = [
+                (actors.tracks[k].world_T_actor[frame - actors.tracks[k].first], body_of(actors, k))
+                for k, count in of_track.most_common()
+                if count > _PART * len(tracked)
+            ]
+            one.overlaps.append(shared_area(found, true))
+            for part, (pose, _) in zip(parts, true, strict=True):
+                of_part = Counter(track_of[near & (owner == part) & (track_of >= 0)].tolist())
+                if of_part and of_part.total() >= _POINTS:
+                    track = actors.tracks[of_part.most_common(1)[0][0]]
+                    turn = (invert(pose) @ track.world_T_actor[frame - track.first])[:2, 0]
+                    one.headings.append(abs(float(np.arctan2(turn[1], turn[0]))))
+    for number in began:
+        counts = held[number]
+        several = [count for count in counts.values() if count > _PART * counts.total()]
+        scores[vehicles[number].name].actors.append(len(several))
     return scores
+
+
+def groups(vehicles: dict[int, Vehicle]) -> dict[int, list[int]]:
+    """Return the numbers of each vehicle and of what it draws, by its number."""
+    found: dict[int, list[int]] = {}
+    for number, vehicle in vehicles.items():
+        found.setdefault(number - 1 if vehicle.drawn_by else number, []).append(number)
+    return found
+
+
+def size_of(vehicle: Vehicle) -> NDArray[np.float64]:
+    """Return (2,) the length and the width of a vehicle, metres."""
+    return np.array([vehicle.kind.length_m, vehicle.kind.width_m])
+
+
+def body_of(actors: MovingActors, number: int) -> NDArray[np.float64]:
+    """Return (2,) the length and the width of a found actor, metres."""
+    return actors.tracks[number].size[:2] - 2 * BODY_MARGIN_M
+
+
+def shared_area(found: list[Rectangle], true: list[Rectangle]) -> float:
+    """Return the IoU of what some boxes cover together, seen from above, by samples of 0.1 m."""
+    corners = np.array([[x, y, 0.0] for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
+    around = np.concatenate(
+        [transform_points(pose, corners * (*size, 1.0)) for pose, size in (*found, *true)]
+    )
+    x, y = (
+        np.arange(low, high, 0.1)
+        for low, high in zip(around.min(axis=0)[:2], around.max(axis=0)[:2], strict=True)
+    )
+    places = np.stack(np.meshgrid(x, y, [0.0]), axis=-1).reshape(-1, 3)
+    inside = np.zeros((2, len(places)), np.bool_)
+    for row, boxes in enumerate((found, true)):
+        for pose, size in boxes:
+            flat = translation((*pose[:2, 3], 0.0)) @ rotation_z(np.arctan2(pose[1, 0], pose[0, 0]))
+            local = transform_points(invert(flat), places)[:, :2]
+            inside[row] |= (np.abs(local) < size / 2).all(axis=1)
+    return float(inside.all(axis=0).sum() / max(inside.any(axis=0).sum(), 1))
 
 
 def measure(setting: Setting, hint: str, work: Path) -> dict[str, Scores]:
@@ -141,7 +188,9 @@ def measure(setting: Setting, hint: str, work: Path) -> dict[str, Scores]:
         grid = dense.make_grid(feed, actors, frame)
         for name, own in scores.items():
             numbers = [
-                EGO_ID + k for k, one in enumerate(square.manoeuvres.movers) if one.name == name
+                EGO_ID + k
+                for k, one in enumerate(square.manoeuvres.movers)
+                if name in (one.name, one.drawn_by and one.drawn_by.name)
             ]
             own.trail.append(dense.trail(grid, drive, frame, square.manoeuvres, numbers))
     return scores

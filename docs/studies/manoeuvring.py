@@ -79,7 +79,7 @@ class Vehicle:
     """A vehicle that follows legs, or is drawn by another one.
 
     Attributes:
-        name: what it does, for the table.
+        name: what it does, for the table; empty if it is drawn.
         kind: its shape.
         start: x, y, metres, and heading, radians, of its rear axle in frame 0.
         legs: what it does; afterwards it stands.
@@ -204,10 +204,10 @@ def _lorry(rng: np.random.Generator) -> Iterator[Vehicle]:
     quarter = np.pi / 2 * radius / speed
     legs = [Leg(float(rng.uniform(1.5, 2.5)), speed), Leg(quarter, speed, -1 / radius)]
     start = float(rng.uniform(43.0, 48.0)), float(rng.uniform(9.0, 11.0)), np.pi
-    tractor = Vehicle("lorry, tractor", _TRACTOR, start, [*legs, Leg(20.0, speed)])
+    tractor = Vehicle("lorry with trailer", _TRACTOR, start, [*legs, Leg(20.0, speed)])
     reach = (1 - _TRAILER.wheels[0][0]) * _TRAILER.length_m - 1.6
     yield tractor
-    yield Vehicle("lorry, trailer", _TRAILER, drawn_by=tractor, joint_m=0.4, reach_m=reach)
+    yield Vehicle("", _TRAILER, drawn_by=tractor, joint_m=0.4, reach_m=reach)
 
 
 def _bus(rng: np.random.Generator) -> Iterator[Vehicle]:
@@ -223,11 +223,11 @@ def _bus(rng: np.random.Generator) -> Iterator[Vehicle]:
         Leg(20.0, speed),
     ]
     start = float(rng.uniform(28.0, 36.0)), -4.8, np.pi
-    front = Vehicle("bus, front", _BUS_FRONT, start, legs)
+    front = Vehicle("articulated bus", _BUS_FRONT, start, legs)
     reach = (1 - _BUS_REAR.wheels[0][0]) * _BUS_REAR.length_m + 0.4
     joint = -_BUS_FRONT.wheels[0][0] * _BUS_FRONT.length_m - 0.4
     yield front
-    yield Vehicle("bus, rear", _BUS_REAR, drawn_by=front, joint_m=joint, reach_m=reach)
+    yield Vehicle("", _BUS_REAR, drawn_by=front, joint_m=joint, reach_m=reach)
 
 
 def _three_moves(rng: np.random.Generator) -> Vehicle:
