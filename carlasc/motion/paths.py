@@ -255,12 +255,14 @@ def headings_of_vehicle(
     seconds: FloatArray,
     length_m: float,
     turns: FloatArray | None = None,
+    *,
+    reverse: bool = False,
 ) -> FloatArray:
     """Return the headings of a vehicle, whose rear axle moves to where it points, or away from it.
 
     The centre of a vehicle moves to where the vehicle points on a straight road only: in a bend, it
     moves aside, as the vehicle turns around a place beside its rear axle. In reverse, it moves
-    backwards: it is ahead more often. Registered turns alone drift, so directions over a second or
+    backwards. Registered turns alone drift, so directions over a second or
     two correct them.
 
     Args:
@@ -268,6 +270,7 @@ def headings_of_vehicle(
         seconds: (F,) times, rising.
         length_m: visible length of the vehicle.
         turns: (F,) registered headings, except for a constant, radians; None: they are unknown.
+        reverse: whether it is in reverse more often.
 
     Returns:
         (F,) radians, unwrapped; those of `headings_of` if few velocities are fast enough.
@@ -281,7 +284,7 @@ def headings_of_vehicle(
     # In reverse, a direction differs from the heading by half a turn.
     left = np.unwrap(directions - known[fast], period=np.pi)
     speeds = np.hypot(x, y) * np.where(np.cos(directions - known[fast] - left) > 0, 1, -1)
-    if speeds.sum() < 0:
+    if (speeds.sum() < 0) != reverse:
         left, speeds = left + np.pi, -speeds
     turning = smooth((known[fast] + left)[:, None], at, weights, _DRIVE_S)[1][:, 0]
     aside = np.clip(_REAR_AXLE * length_m * turning / speeds, -_MOST_ASIDE, _MOST_ASIDE)

@@ -53,7 +53,7 @@ _SURE = 0.8  # actors with less confidence are doubtful
 _END = 0.02  # share of the points of a scan beyond each end of what it shows
 _ASIDE = 0.1  # weight of an end that is not turned to the sensor
 _AGREE_M = 0.5  # an end that is farther from its usual place is that of a part of the actor
-_ROUNDS, _TURNS_RAD = 3, 0.1
+_ROUNDS, _TURNS_RAD, _SURELY = 3, 0.1, 0.8
 _SETTLED_S, _SETTLED_POINTS = 1.5, 200  # positions change over so long; no scan weighs more
 FIRST_FOUND = 1 << 33  # found actors are numbered from here, above all instances
 _FORMATS = {
@@ -198,8 +198,14 @@ def make_track(
         positions, headings = _integrate(velocities, seconds, chain), headings_of(velocities)
         if keeps_shape:
             length_m = length_of([segment.points for segment in chain])
-            headings = headings_of_vehicle(velocities, seconds, length_m)
-            positions = _anchor(chain, positions, headings)
+            # Ahead or in reverse: a vehicle turns around its rear axle, so the ends agree once.
+            ways = [
+                headings_of_vehicle(velocities, seconds, length_m, reverse=is_reverse)
+                for is_reverse in (False, True)
+            ]
+            places, errors = zip(*(_anchor(chain, positions, way) for way in ways), strict=True)
+            way = int(errors[1] < _SURELY * errors[0])
+            positions, headings = places[way], ways[way]
     positions, extent, body = _fit_box(chain, positions, headings)
     frames, at = _frames_around(chain[0].frame, chain[-1].frame, times)
     places, speed = resample(at, seconds, positions, velocities)
@@ -322,9 +328,9 @@ def _settle(
 
 def _anchor(
     chain: Sequence[Segment], positions: FloatArray, headings: FloatArray
-) -> FloatArray:
+) -> tuple[FloatArray, float]:
     """Return (F, 3) positions with the constant offset at which the visible ends of an actor that
-    turns agree. Its path is known except for this offset.
+    turns agree, and their mean squared distance, metres. Its path is known except for this offset.
     """
     moved = positions
     for _ in range(_ROUNDS):
@@ -343,7 +349,7 @@ def _anchor(
             error = values - multiply(design, fit)
             root = np.sqrt(weights.reshape(-1, 1) / (1 + (error / _AGREE_M) ** 2))
         moved = moved + np.append(fit[4:, 0], 0.0)
-    return moved
+    return moved, float(np.square(error * root).sum() / np.square(root).sum())
 
 
 def _fit_box(
