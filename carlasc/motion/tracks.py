@@ -33,6 +33,7 @@ from carlasc.core.geometry import (
 from carlasc.errors import reading
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent, Sizes, measure, surface_of
 from carlasc.motion.paths import (
+    SURELY,
     Path,
     Segment,
     headings_of_vehicle,
@@ -53,7 +54,7 @@ _SURE = 0.8  # actors with less confidence are doubtful
 _END = 0.02  # share of the points of a scan beyond each end of what it shows
 _ASIDE = 0.1  # weight of an end that is not turned to the sensor
 _AGREE_M = 0.5  # an end that is farther from its usual place is that of a part of the actor
-_ROUNDS, _TURNS_RAD, _SURELY = 3, 0.1, 0.8
+_ROUNDS, _TURNS_RAD = 3, 0.1
 _SETTLED_S, _SETTLED_POINTS = 1.5, 200  # positions change over so long; no scan weighs more
 FIRST_FOUND = 1 << 33  # found actors are numbered from here, above all instances
 _FORMATS = {
@@ -204,7 +205,7 @@ def make_track(
                 for is_reverse in (False, True)
             ]
             places, errors = zip(*(_anchor(chain, positions, way) for way in ways), strict=True)
-            way = int(errors[1] < _SURELY * errors[0])
+            way = int(errors[1] < SURELY * errors[0])
             positions, headings = places[way], ways[way]
     positions, extent, body = _fit_box(chain, positions, headings)
     frames, at = _frames_around(chain[0].frame, chain[-1].frame, times)
