@@ -204,9 +204,11 @@ def make_track(
                 headings_of_vehicle(velocities, seconds, length_m, reverse=is_reverse)
                 for is_reverse in (False, True)
             ]
-            places, errors = zip(*(_anchor(chain, positions, way) for way in ways), strict=True)
-            way = int(errors[1] < SURELY * errors[0])
-            positions, headings = places[way], ways[way]
+            headings = ways[0]
+            if np.ptp(headings) > _TURNS_RAD:
+                places, errors = zip(*(_anchor(chain, positions, way) for way in ways), strict=True)
+                way = int(errors[1] < SURELY * errors[0])
+                positions, headings = places[way], ways[way]
     positions, extent, body = _fit_box(chain, positions, headings)
     frames, at = _frames_around(chain[0].frame, chain[-1].frame, times)
     places, speed = resample(at, seconds, positions, velocities)

