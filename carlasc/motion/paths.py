@@ -45,8 +45,7 @@ _MIN_TURNS = 4  # least number of such directions
 # The rear axle is so far behind the centre, in lengths of the vehicle. No vehicle moves farther
 # aside: the sine.
 _REAR_AXLE, _MOST_ASIDE = 0.3, 0.5
-_BEND_RAD = 0.5  # actors that turn by more show whether they are in reverse
-SURELY = 0.8  # greatest share of an error, if something is not what it is more often
+_STEADY_RAD, _REVERSE = 0.06, 0.4  # changes by less are noise; least share in reverse
 
 _INITIAL_S = 0.5  # half width of the window for the initial estimate of the motion
 _REGISTERED = 300  # number of points of an observation that are registered to the model
@@ -255,22 +254,17 @@ def headings_of_vehicle(
     seconds: FloatArray,
     length_m: float,
     turns: FloatArray | None = None,
-    *,
-    reverse: bool = False,
 ) -> FloatArray:
-    """Return the headings of a vehicle, whose rear axle moves to where it points, or away from it.
+    """Return the headings of a vehicle, which moves ahead or in reverse.
 
-    The centre of a vehicle moves to where the vehicle points on a straight road only: in a bend, it
-    moves aside, as the vehicle turns around a place beside its rear axle. In reverse, it moves
-    backwards. Registered turns alone drift, so directions over a second or
-    two correct them.
+    On a straight road, its centre moves to where the vehicle points. In a bend, it moves aside, as
+    the rear axle does not. Registered turns drift; directions over a second or two correct them.
 
     Args:
         velocities: (F, 3) m/s.
         seconds: (F,) times, rising.
-        length_m: visible length of the vehicle.
+        length_m: visible length of the vehicle; 0: its centre does not move aside.
         turns: (F,) registered headings, except for a constant, radians; None: they are unknown.
-        reverse: whether it is in reverse more often.
 
     Returns:
         (F,) radians, unwrapped; those of `headings_of` if few velocities are fast enough.
@@ -281,20 +275,22 @@ def headings_of_vehicle(
     known = np.zeros(len(velocities)) if turns is None else turns
     x, y, _ = velocities[fast].T
     directions, at, weights = np.arctan2(y, x), seconds[fast], np.ones(len(fast))
-    # In reverse, a direction differs from the heading by half a turn.
+    # In reverse, a direction differs from the heading by half a turn. It is ahead more often.
     left = np.unwrap(directions - known[fast], period=np.pi)
     speeds = np.hypot(x, y) * np.where(np.cos(directions - known[fast] - left) > 0, 1, -1)
-    if (speeds.sum() < 0) != reverse:
+    if speeds.sum() < 0:
         left, speeds = left + np.pi, -speeds
     turning = smooth((known[fast] + left)[:, None], at, weights, _DRIVE_S)[1][:, 0]
     aside = np.arcsin(np.clip(_REAR_AXLE * length_m * turning / speeds, -_MOST_ASIDE, _MOST_ASIDE))
-    # Where it turns, registration may show that it is the other way.
-    if np.ptp(known) > _BEND_RAD and np.std(left + aside) < SURELY * np.std(left - aside):
-        left, aside = left + np.pi, -aside
-    left = left - aside
-    if turns is not None:
-        left = smooth(left[:, None], at, weights, _TURN_S)[0][:, 0]
-    return known + np.interp(np.arange(len(velocities)), fast, left)
+    if turns is None:
+        return np.interp(np.arange(len(velocities)), fast, left - aside)
+    # Registration shows how far aside it moves, and whether it is in reverse: then the other way.
+    change, moved = aside - aside.mean(), left - left.mean()
+    share = float((change * moved).sum() / (np.square(change) + _STEADY_RAD**2).sum())
+    if share < -_REVERSE:
+        left = left + np.pi
+    left = smooth((left - np.clip(share, -1.0, 1.0) * aside)[:, None], at, weights, _TURN_S)[0]
+    return known + np.interp(np.arange(len(velocities)), fast, left[:, 0])
 
 
 def length_of(observations: Sequence[FloatArray]) -> float:

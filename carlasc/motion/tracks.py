@@ -33,7 +33,6 @@ from carlasc.core.geometry import (
 from carlasc.errors import reading
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent, Sizes, measure, surface_of
 from carlasc.motion.paths import (
-    SURELY,
     Path,
     Segment,
     headings_of_vehicle,
@@ -55,6 +54,7 @@ _END = 0.02  # share of the points of a scan beyond each end of what it shows
 _ASIDE = 0.1  # weight of an end that is not turned to the sensor
 _AGREE_M = 0.5  # an end that is farther from its usual place is that of a part of the actor
 _ROUNDS, _TURNS_RAD = 3, 0.1
+_SURELY = 0.8  # a vehicle turns around its rear axle if its ends agree better by this factor
 _SETTLED_S, _SETTLED_POINTS = 1.5, 200  # positions change over so long; no scan weighs more
 FIRST_FOUND = 1 << 33  # found actors are numbered from here, above all instances
 _FORMATS = {
@@ -199,16 +199,14 @@ def make_track(
         positions, headings = _integrate(velocities, seconds, chain), headings_of(velocities)
         if keeps_shape:
             length_m = length_of([segment.points for segment in chain])
-            # Ahead or in reverse: a vehicle turns around its rear axle, so the ends agree once.
-            ways = [
-                headings_of_vehicle(velocities, seconds, length_m, reverse=is_reverse)
-                for is_reverse in (False, True)
-            ]
-            headings = ways[0]
+            headings, around_axle = (
+                headings_of_vehicle(velocities, seconds, length) for length in (0.0, length_m)
+            )
             if np.ptp(headings) > _TURNS_RAD:
-                places, errors = zip(*(_anchor(chain, positions, way) for way in ways), strict=True)
-                way = int(errors[1] < SURELY * errors[0])
-                positions, headings = places[way], ways[way]
+                place, error = _anchor(chain, positions, headings)
+                other, least = _anchor(chain, positions, around_axle)
+                is_better = least < _SURELY * error
+                positions, headings = (other, around_axle) if is_better else (place, headings)
     positions, extent, body = _fit_box(chain, positions, headings)
     frames, at = _frames_around(chain[0].frame, chain[-1].frame, times)
     places, speed = resample(at, seconds, positions, velocities)

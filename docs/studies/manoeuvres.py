@@ -38,7 +38,7 @@ from carlasc.motion.tracks import MovingActors
 
 SEEDS = {"manoeuvres": range(461, 466)}
 HINTS = {"flow": FLOW, "free space": EVIDENCE}
-FRAMES = (30, 45, 60)  # whose trails are measured
+FRAME = 45  # whose trail is measured
 _MOVES_M_S = 1.0  # a vehicle is judged in scans in which it moves faster, or did so before
 _POINTS = 30  # least number of points in a scan
 _PART = 0.1  # of a vehicle's points, that an actor holds
@@ -184,15 +184,15 @@ def measure(setting: Setting, hint: str, work: Path) -> dict[str, Scores]:
     feed = ScanFeed(drive.sequence, HINTS[hint])
     actors, square = find_actors(feed), ManoeuvreDrive(setting.seed)
     scores = judge(drive, actors, square)
-    for frame in (4,) if study.is_tiny() else FRAMES:
-        grid = dense.make_grid(feed, actors, frame)
-        for name, own in scores.items():
-            numbers = [
-                EGO_ID + k
-                for k, one in enumerate(square.manoeuvres.movers)
-                if name in (one.name, one.drawn_by and one.drawn_by.name)
-            ]
-            own.trail.append(dense.trail(grid, drive, frame, square.manoeuvres, numbers))
+    frame = 4 if study.is_tiny() else FRAME
+    grid, population = dense.make_grid(feed, actors, frame), square.manoeuvres
+    for name, own in scores.items():
+        numbers = [
+            EGO_ID + k
+            for k, one in enumerate(population.movers)
+            if name in (one.name, one.drawn_by and one.drawn_by.name)
+        ]
+        own.trail.append(dense.trail(grid, drive, frame, population, numbers))
     return scores
 
 

@@ -121,37 +121,35 @@ def test_a_vehicle_in_a_bend_points_where_registration_says():
     assert np.abs(by_turns[:12]).max() < 0.6 * np.abs(by_motion[:12]).max()
 
 
-def manoeuvre(speeds: FloatArray, length_m: float = 5.0) -> tuple[FloatArray, FloatArray]:
-    """Return the headings and the velocities of the centre of a vehicle that turns all the time,
+def manoeuvre(speeds: FloatArray, rates: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the headings and the velocities of the centre of a vehicle, 5 m long, that turns
     around a place beside its rear axle.
     """
-    headings = 0.5 + 0.4 * SECONDS
+    headings = 0.5 + np.cumsum(rates) * PERIOD_S
     along, aside = (
         np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(SECONDS))])
         for angle in (headings, headings + np.pi / 2)
     )
-    return headings, speeds[:, None] * along + 0.4 * 0.3 * length_m * aside
+    return headings, speeds[:, None] * along + (rates * 0.3 * 5.0)[:, None] * aside
 
 
 @pytest.mark.parametrize("is_registered", [False, True])
 def test_a_vehicle_that_goes_back_and_forth_keeps_its_front(is_registered):
-    speeds = 4.0 * np.where(SECONDS[-1] / 3 > SECONDS, -1.0, 1.0)
-    headings, velocities = manoeuvre(speeds)
+    back = SECONDS[-1] / 3 > SECONDS
+    headings, velocities = manoeuvre(np.where(back, -4.0, 4.0), np.where(back, 0.0, 0.5))
     turns = headings - headings[0] if is_registered else None
     found = headings_of_vehicle(velocities, SECONDS, 5.0, turns)
-    off = np.angle(np.exp(1j * (found - headings)))
-    assert np.abs(off).mean() < 0.05
+    assert np.abs(np.angle(np.exp(1j * (found - headings)))).mean() < 0.08
     assert np.abs(np.angle(np.exp(1j * (headings_of(velocities) - headings)))).max() > 2.9
 
 
 def test_registration_shows_that_a_vehicle_is_in_reverse_in_a_bend():
-    headings, velocities = manoeuvre(np.full(len(SECONDS), -4.0))
+    rates = np.where(SECONDS[-1] / 2 > SECONDS, 0.0, 0.6)
+    headings, velocities = manoeuvre(np.full(len(SECONDS), -4.0), rates)
     found = headings_of_vehicle(velocities, SECONDS, 5.0, headings)
-    assert np.abs(np.angle(np.exp(1j * (found - headings)))).max() < 0.05
+    assert np.abs(np.angle(np.exp(1j * (found - headings)))).mean() < 0.1
     without = headings_of_vehicle(velocities, SECONDS, 5.0)
     assert np.abs(np.angle(np.exp(1j * (without - headings)))).min() > 2.5
-    given = headings_of_vehicle(velocities, SECONDS, 5.0, reverse=True)
-    assert np.abs(np.angle(np.exp(1j * (given - headings)))).max() < 0.05
 
 
 def test_observations_are_laid_on_each_other_near_what_is_known():
