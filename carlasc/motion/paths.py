@@ -45,7 +45,8 @@ _MIN_TURNS = 4  # least number of such directions
 # The rear axle is so far behind the centre, in lengths of the vehicle. No vehicle moves farther
 # aside: the sine.
 _REAR_AXLE, _MOST_ASIDE = 0.3, 0.5
-_STEADY_RAD, _REVERSE = 0.06, 0.4  # changes by less are noise; least share in reverse
+# Changes by less are noise; least share in reverse, of a vehicle that turns by so much.
+_STEADY_RAD, _REVERSE, _BEND_RAD = 0.06, 0.4, 0.5
 
 _INITIAL_S = 0.5  # half width of the window for the initial estimate of the motion
 _REGISTERED = 300  # number of points of an observation that are registered to the model
@@ -287,7 +288,7 @@ def headings_of_vehicle(
     # Registration shows how far aside it moves, and whether it is in reverse: then the other way.
     change, moved = aside - aside.mean(), left - left.mean()
     share = float((change * moved).sum() / (np.square(change) + _STEADY_RAD**2).sum())
-    if share < -_REVERSE:
+    if share < -_REVERSE and np.ptp(turns) > _BEND_RAD:
         left = left + np.pi
     left = smooth((left - np.clip(share, -1.0, 1.0) * aside)[:, None], at, weights, _TURN_S)[0]
     return known + np.interp(np.arange(len(velocities)), fast, left[:, 0])
