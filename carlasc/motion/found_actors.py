@@ -41,7 +41,9 @@ _REACH_M, _MAX_SPEED_M_S = (
 _FAR_M = 15.0  # fast first test: no actor moves farther between two observations
 _HISTORY = 6  # observations that the prediction is made from
 _MIN_OBSERVATIONS, _MIN_PATH_M, _MIN_SPEED_M_S = 5, 1.0, 0.5  # an actor needs so much for a track
-_STRAIGHT = 0.35  # least extent of a path over its length: noise moves back and forth
+# Least extent of a path over its length: noise moves back and forth. So do vehicles that manoeuvre,
+# but their observations align by this share of their distance without motion.
+_STRAIGHT, _MANOEUVRES = 0.35, 0.5
 _MAX_JUMP_M_S = 4.0  # greatest median deviation of the observations' steps from the path's
 _PARTS_M = 1.0  # parts of one vehicle are closer to each other
 _BESIDE_RAD = 0.012  # and no wider gap is between their directions
@@ -379,7 +381,9 @@ class _ActorChain:
             return None
         length = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1).sum()
         if np.ptp(positions[:, :2], axis=0).max() < _STRAIGHT * length:
-            return None
+            still, moved = misalignment(samples, positions, headings, seconds)
+            if not moved < _MANOEUVRES * still:
+                return None
         middles = np.stack([link.middle for link in self.links])
         steps = np.linalg.norm(np.diff(middles - positions, axis=0)[:, :2], axis=1) / np.diff(
             seconds

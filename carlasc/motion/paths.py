@@ -42,6 +42,11 @@ _MAX_DISTANCE_M, _DOUBT_M = 0.5, 0.02
 _STATIC_M = 0.38
 _TURN_S = 1.0  # half width of the window in which directions correct registered turns
 _MIN_TURNS = 4  # least number of such directions
+# The rear axle is so far behind the centre, in lengths of the vehicle. No vehicle moves farther
+# aside: the sine.
+_REAR_AXLE, _MOST_ASIDE = 0.3, 0.5
+# Changes by less are noise; least share in reverse, of a vehicle that turns by so much.
+_STEADY_RAD, _REVERSE, _BEND_RAD = 0.06, 0.4, 0.5
 
 _INITIAL_S = 0.5  # half width of the window for the initial estimate of the motion
 _REGISTERED = 300  # number of points of an observation that are registered to the model
@@ -167,7 +172,7 @@ def estimate_path(
     return (
         positions,
         velocities,
-        headings_by_turns(velocities, np.interp(seconds, at, turns), seconds),
+        headings_of_vehicle(velocities, seconds, length_of(chosen), np.interp(seconds, at, turns)),
     )
 
 
@@ -245,28 +250,54 @@ def _limit_acceleration(velocities: FloatArray, seconds: FloatArray, best: int) 
     return bounded
 
 
-def headings_by_turns(velocities: FloatArray, turns: FloatArray, seconds: FloatArray) -> FloatArray:
-    """Return headings: registered turns, corrected by the directions of motion over a second or
-    two.
+def headings_of_vehicle(
+    velocities: FloatArray,
+    seconds: FloatArray,
+    length_m: float,
+    turns: FloatArray | None = None,
+) -> FloatArray:
+    """Return the headings of a vehicle, which moves ahead or in reverse.
 
-    Directions of motion alone are wrong where a vehicle enters a bend, as it does not move where it
-    points. Registered turns alone drift.
+    On a straight road, its centre moves to where the vehicle points. In a bend, it moves aside, as
+    the rear axle does not. Registered turns drift; directions over a second or two correct them.
 
     Args:
         velocities: (F, 3) m/s.
-        turns: (F,) registered headings, except for a constant, radians.
         seconds: (F,) times, rising.
+        length_m: visible length of the vehicle; 0: its centre does not move aside.
+        turns: (F,) registered headings, except for a constant, radians; None: they are unknown.
 
     Returns:
         (F,) radians, unwrapped; those of `headings_of` if few velocities are fast enough.
     """
-    fast, directions = fast_rows(velocities), headings_of(velocities)
+    fast = fast_rows(velocities)
     if len(fast) < _MIN_TURNS:
-        return directions
-    left = smooth((directions - turns)[fast, None], seconds[fast], np.ones(len(fast)), _TURN_S)[0][
-        :, 0
-    ]
-    return turns + np.interp(np.arange(len(velocities)), fast, left)
+        return headings_of(velocities)
+    known = np.zeros(len(velocities)) if turns is None else turns
+    x, y, _ = velocities[fast].T
+    directions, at, weights = np.arctan2(y, x), seconds[fast], np.ones(len(fast))
+    # In reverse, a direction differs from the heading by half a turn. It is ahead more often.
+    left = np.unwrap(directions - known[fast], period=np.pi)
+    speeds = np.hypot(x, y) * np.where(np.cos(directions - known[fast] - left) > 0, 1, -1)
+    if speeds.sum() < 0:
+        left, speeds = left + np.pi, -speeds
+    turning = smooth((known[fast] + left)[:, None], at, weights, _DRIVE_S)[1][:, 0]
+    aside = np.arcsin(np.clip(_REAR_AXLE * length_m * turning / speeds, -_MOST_ASIDE, _MOST_ASIDE))
+    if turns is None:
+        return np.interp(np.arange(len(velocities)), fast, left - aside)
+    # Registration shows how far aside it moves, and whether it is in reverse: then the other way.
+    change, moved = aside - aside.mean(), left - left.mean()
+    share = float((change * moved).sum() / (np.square(change) + _STEADY_RAD**2).sum())
+    if share < -_REVERSE and np.ptp(turns) > _BEND_RAD:
+        left = left + np.pi
+    left = smooth((left - np.clip(share, -1.0, 1.0) * aside)[:, None], at, weights, _TURN_S)[0]
+    return known + np.interp(np.arange(len(velocities)), fast, left[:, 0])
+
+
+def length_of(observations: Sequence[FloatArray]) -> float:
+    """Return the visible length of an actor, metres, from its (M, 3) points in each scan."""
+    sizes = [np.hypot(*np.ptp(points[:, :2], axis=0)) for points in observations]
+    return float(np.quantile(sizes, 0.8))
 
 
 def follow(

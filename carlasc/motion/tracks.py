@@ -32,9 +32,16 @@ from carlasc.core.geometry import (
 )
 from carlasc.errors import reading
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent, Sizes, measure, surface_of
-from carlasc.motion.paths import Path, Segment, is_static, path_of
+from carlasc.motion.paths import (
+    Path,
+    Segment,
+    headings_of_vehicle,
+    is_static,
+    length_of,
+    path_of,
+)
 from carlasc.motion.segments import MIN_SPEED_M_S
-from carlasc.motion.solving import headings_of, resample, smooth
+from carlasc.motion.solving import headings_of, least_squares, resample, smooth
 from carlasc.storage.arrays import ArrayFormat, open_npz
 from carlasc.storage.files import parse_json
 
@@ -46,6 +53,8 @@ _SURE = 0.8  # actors with less confidence are doubtful
 _END = 0.02  # share of the points of a scan beyond each end of what it shows
 _ASIDE = 0.1  # weight of an end that is not turned to the sensor
 _AGREE_M = 0.5  # an end that is farther from its usual place is that of a part of the actor
+_ROUNDS, _TURNS_RAD = 3, 0.1
+_SURELY = 0.8  # a vehicle turns around its rear axle if its ends agree better by this factor
 _SETTLED_S, _SETTLED_POINTS = 1.5, 200  # positions change over so long; no scan weighs more
 FIRST_FOUND = 1 << 33  # found actors are numbered from here, above all instances
 _FORMATS = {
@@ -182,13 +191,22 @@ def make_track(
                 np.zeros_like(values) for values in (positions, velocities, headings)
             )
         elif keeps_shape:
-            positions, _, _ = _fit_box(chain, positions, headings)
             positions = _settle(chain, positions, headings, seconds)
     else:
         velocities = np.stack(
             [segment.velocity for segment in chain if segment.velocity is not None]
         )
         positions, headings = _integrate(velocities, seconds, chain), headings_of(velocities)
+        if keeps_shape:
+            length_m = length_of([segment.points for segment in chain])
+            headings, around_axle = (
+                headings_of_vehicle(velocities, seconds, length) for length in (0.0, length_m)
+            )
+            if np.ptp(headings) > _TURNS_RAD:
+                place, error = _anchor(chain, positions, headings)
+                other, least = _anchor(chain, positions, around_axle)
+                is_better = least < _SURELY * error
+                positions, headings = (other, around_axle) if is_better else (place, headings)
     positions, extent, body = _fit_box(chain, positions, headings)
     frames, at = _frames_around(chain[0].frame, chain[-1].frame, times)
     places, speed = resample(at, seconds, positions, velocities)
@@ -262,27 +280,40 @@ def _integrate(velocities: FloatArray, seconds: FloatArray, chain: Sequence[Segm
     return path - path[best] + chain[best].center
 
 
+def _visible_ends(
+    chain: Sequence[Segment], positions: FloatArray, headings: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what each scan shows of the ends of an actor.
+
+    Ends towards the sensor are seen in most scans, and do not depend on the path.
+
+    Returns:
+        (F, 2, 2) rotations from the actor to the world, (F, 2, 2) the ends: lower and upper, x and
+        y, metres, actor frame, and (F, 2, 2) how much each is turned to the sensor.
+    """
+    turns = np.stack([rotation_z(heading) for heading in headings])
+    backwards, ends = invert(turns), list[FloatArray]()
+    for segment, turn, position in zip(chain, backwards, positions, strict=True):
+        own = rotate_vectors(turn, segment.points - position)[:, :2]
+        ends.append(np.quantile(own, (_END, 1 - _END), axis=0))
+    origins = np.stack([segment.origin for segment in chain]) - positions
+    places = multiply(backwards[:, :3, :3], origins[..., None])[:, None, :2, 0]
+    faces = np.array(ends)
+    beyond = (np.median(faces, axis=0) - places) * np.array([[1], [-1]])
+    distance = np.maximum(np.linalg.norm(places, axis=2, keepdims=True), 1e-6)
+    return turns[:, :2, :2], faces, _ASIDE + np.clip(beyond / distance, 0, 1)
+
+
 def _settle(
     chain: Sequence[Segment], positions: FloatArray, headings: FloatArray, seconds: FloatArray
 ) -> FloatArray:
     """Return (F, 3) positions at which the visible ends of the actor agree.
 
-    A path that is a little wrong for seconds smears the body. The ends that one scan shows do not
-    depend on the path, and those towards the sensor are seen in most scans. Where a scan shows a
-    part of the actor only, its ends are elsewhere, and do not count.
+    A path that is a little wrong for seconds smears the body. Where a scan shows a part of the
+    actor only, its ends are elsewhere, and do not count.
     """
-    turns, ends, sensors = [], [], []
-    for segment, position, heading in zip(chain, positions, headings, strict=True):
-        turn = rotation_z(heading)
-        own = rotate_vectors(invert(turn), segment.points - position)[:, :2]
-        turns.append(turn)
-        ends.append(np.quantile(own, (_END, 1 - _END), axis=0))
-        sensors.append(rotate_vectors(invert(turn), segment.origin - position)[:2])
+    turns, faces, weights = _visible_ends(chain, positions, headings)
     counts = np.minimum([len(segment.points) for segment in chain], _SETTLED_POINTS)
-    faces, places = np.array(ends), np.stack(sensors)[:, None]
-    beyond = (np.median(faces, axis=0) - places) * np.array([[1], [-1]])
-    distance = np.maximum(np.linalg.norm(places, axis=2, keepdims=True), 1e-6)
-    weights = _ASIDE + np.clip(beyond / distance, 0, 1)
     order = np.argsort(faces, axis=0, kind="stable")
     total = np.cumsum(np.take_along_axis(weights * counts[:, None, None], order, 0), axis=0)
     middle = (total < total[-1] / 2).sum(axis=0)[None]
@@ -291,11 +322,35 @@ def _settle(
     weights = weights * agree + 1e-9  # no scan is without weight
     shifts = (weights * agree * (faces - usual)).sum(axis=1) / weights.sum(axis=1)
     moved, _ = smooth(shifts, seconds, counts.astype(np.float64), _SETTLED_S)
-    moves = (
-        rotate_vectors(turn, np.append(shift, 0.0))
-        for turn, shift in zip(turns, moved, strict=True)
-    )
-    return positions + np.stack(list(moves))
+    settled = positions.copy()
+    settled[:, :2] += multiply(turns, moved[..., None])[..., 0]
+    return settled
+
+
+def _anchor(
+    chain: Sequence[Segment], positions: FloatArray, headings: FloatArray
+) -> tuple[FloatArray, float]:
+    """Return (F, 3) positions with the constant offset at which the visible ends of an actor that
+    turns agree, and their mean squared distance, metres. Its path is known except for this offset.
+    """
+    moved = positions
+    for _ in range(_ROUNDS):
+        turns, faces, weights = _visible_ends(chain, moved, headings)
+        # Each end is where it is on the body, and shifted by the offset as the body sees it.
+        shifts = np.repeat(np.swapaxes(turns, 1, 2)[:, None], 2, axis=1).reshape(-1, 2)
+        design = np.hstack([np.tile(np.eye(4), (len(chain), 1)), shifts])
+        values, root = faces.reshape(-1, 1), np.sqrt(weights.reshape(-1, 1))
+        # An offset matters, and is known, where the actor turns by more than this.
+        few = np.zeros((2, 6))
+        few[:, 4:] = np.eye(2) * _TURNS_RAD * np.sqrt(weights.sum())
+        for _ in range(_ROUNDS):  # parts of the actor have their ends elsewhere
+            fit = least_squares(
+                np.concatenate([design * root, few]), np.concatenate([values * root, few[:, :1]])
+            )
+            error = values - multiply(design, fit)
+            root = np.sqrt(weights.reshape(-1, 1) / (1 + (error / _AGREE_M) ** 2))
+        moved = moved + np.append(fit[4:, 0], 0.0)
+    return moved, float(np.square(error * root).sum() / np.square(root).sum())
 
 
 def _fit_box(
@@ -303,27 +358,18 @@ def _fit_box(
 ) -> tuple[FloatArray, Extent, FloatArray]:
     """Move the path to the centre of the visible part of the actor; return it, the extent, and the
     points in the actor frame.
-
-    The path is known except for a constant offset in the world. If the actor turns, the segments
-    overlap only with the correct offset, which moves the origin to their centre.
     """
-    best = int(np.argmax([len(segment.members) for segment in chain]))
     counts = np.array([len(segment.points) for segment in chain])
     points = np.concatenate([segment.points for segment in chain])
-    origins = np.stack([segment.origin for segment in chain])
     poses = np.stack([rotation_z(heading) for heading in headings])
-    # Moving the origin changes which points overlap, and thus the extent: three rounds, of which
-    # the last one changes millimetres.
-    for _ in range(3):
-        poses[:, :3, 3] = positions
-        actor_T_world = invert(poses)
-        sensors = transform_each(actor_T_world, origins)
-        body = transform_each(np.repeat(actor_T_world, counts, axis=0), points)
-        extent = measure(body, counts, sensors)
-        middle = (extent.lower + extent.upper) / 2
-        positions = positions + rotate_vectors(rotation_z(headings[best]), middle)
-        extent = replace(extent, lower=extent.lower - middle, upper=extent.upper - middle)
-    return positions, extent, body - middle
+    poses[:, :3, 3] = positions
+    actor_T_world = invert(poses)
+    sensors = transform_each(actor_T_world, np.stack([segment.origin for segment in chain]))
+    body = transform_each(np.repeat(actor_T_world, counts, axis=0), points)
+    extent = measure(body, counts, sensors)
+    middle = (extent.lower + extent.upper) / 2
+    extent = replace(extent, lower=extent.lower - middle, upper=extent.upper - middle)
+    return positions + multiply(poses[:, :3, :3], middle[:, None])[..., 0], extent, body - middle
 
 
 def _frames_around(

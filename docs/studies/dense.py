@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,7 +23,9 @@ from carlasc_recorders.town.actors import EGO_ID
 from movers_drives import GRIDS, Recorded, Setting, owners, record_all
 from movers_rows import EVIDENCE, NoisyPoses, Only
 from numpy.typing import NDArray
+from street import StreetPopulation
 
+from carlasc import Grid
 from carlasc.captures.settings import EGO_SENSOR_M
 from carlasc.core.frames import FrameRange
 from carlasc.core.geometry import invert, transform_points, translation
@@ -121,16 +124,18 @@ def score(drive: Recorded, actors: MovingActors, kinds: dict[int, str]) -> Score
     return found
 
 
-def trail(drive: Recorded, feed: ScanFeed, actors: MovingActors, crowd: crowded.Crowd) -> float:
-    """Return the share, in percent, of the voxels that movers passed at other times and that are
-    empty in the frame, which its ground truth calls occupied.
+def trail(
+    grid: Grid,
+    drive: Recorded,
+    frame: int,
+    population: StreetPopulation,
+    numbers: Collection[int] | None = None,
+) -> tuple[int, int]:
+    """Return how many voxels of the ground truth of a frame are occupied, of those that movers
+    passed at other times and that are empty in the frame, and how many these are; `numbers` are
+    those of the movers, None for all.
     """
-    frame, spec, sequence = crowded.FRAMES // 2, GRIDS["0.2 m"], drive.sequence
-    if study.is_tiny():
-        frame = 4
-    voting = Voting(keep_evidence=True)
-    plan = GridPlan(spec, "grid", EVIDENCE, voting, FrameRange())
-    grid = merge_frame(plan, feed, actors, frame, feed.reaching(frame, spec)).grid
+    spec, sequence = grid.spec, drive.sequence
     world_T_grid, passed, held = sequence.read_pose(frame), set[int](), set[int]()
     for other in sequence.frames("points").tolist():
         points = sequence.read("points", other)[:, :3]
@@ -139,13 +144,23 @@ def trail(drive: Recorded, feed: ScanFeed, actors: MovingActors, crowd: crowded.
         voxels = spec.flat_index(there)
         above = there[:, 2] > _ABOVE_M - EGO_SENSOR_M[2]
         if other != frame:
-            passed.update(voxels[fast & above].tolist())
+            own = fast & above
+            if numbers is not None:
+                own &= np.isin(sequence.read("instances", other), list(numbers))
+            passed.update(voxels[own].tolist())
         held.update(voxels[~fast | (other == frame)].tolist())
-    ego = crowd.ego_pose(frame) @ translation(EGO_SENSOR_M)
-    here = [actor for actor in crowd.at(frame) if np.hypot(*actor.world_T_actor[:2, 3]) < 200]
+    ego = population.ego_pose(frame) @ translation(EGO_SENSOR_M)
+    here = [actor for actor in population.at(frame) if np.hypot(*actor.world_T_actor[:2, 3]) < 200]
     held.update(np.flatnonzero(owners(here, invert(ego), spec)).tolist())
-    empty = np.array(sorted(passed - held - {-1}))
-    return 100 * float((grid.labels.reshape(-1)[empty] != 0).mean())
+    empty = np.array(sorted(passed - held - {-1}), np.int64)
+    return int((grid.labels.reshape(-1)[empty] != 0).sum()), len(empty)
+
+
+def make_grid(feed: ScanFeed, actors: MovingActors, frame: int) -> Grid:
+    """Return the ground truth of a frame, with voxels of 0.2 m."""
+    spec = GRIDS["0.2 m"]
+    plan = GridPlan(spec, "grid", feed.options, Voting(keep_evidence=True), FrameRange())
+    return merge_frame(plan, feed, actors, frame, feed.reaching(frame, spec)).grid
 
 
 def row(name: str, scores: Scores, actors: MovingActors) -> str:
@@ -189,7 +204,9 @@ def measure(setting: Setting, work: Path, *, noisy: bool = False) -> str:
     crowd = crowded.CrowdedDrive(setting.seed).crowd
     kinds = {EGO_ID + k: user.kind for k, user in enumerate(crowd.movers)}
     scores = score(drive, actors, kinds)
-    scores.cpu_s, scores.trail = cpu_s, trail(drive, feed, actors, crowd)
+    frame = 4 if study.is_tiny() else crowded.FRAMES // 2
+    occupied, empty = trail(make_grid(feed, actors, frame), drive, frame, crowd)
+    scores.cpu_s, scores.trail = cpu_s, 100 * occupied / max(empty, 1)
     return row(str(setting), scores, actors)
 
 

@@ -103,7 +103,8 @@ def tasks_of(given: argparse.Namespace) -> list[Task]:
         ],
         "errors": each(32, "coarse", (*UNCHANGED, *ablations)),
         "turning": [
-            Task(Setting(*drive, 32, *turns), ("coarse",), turning, work)
+            Task(Setting(*drive, channels, *turns), ("coarse",), turning, work)
+            for channels in given.channels
             for turns in TURNS
             for drive in drives
         ],
@@ -274,6 +275,9 @@ def main() -> None:
     )
     parser.add_argument(
         "--part", choices=PARTS, action="append", help="only this part of the page; may be repeated"
+    )
+    parser.add_argument(
+        "--channels", nargs="*", type=int, choices=(16, 32, 64), default=[32], help="that turn"
     )
     parser.add_argument(
         "--tables", action="store_true", help="only write the tables of what WORK has"

@@ -17,6 +17,8 @@ from carlasc_recorders.town.actors import EGO_ID
 from carlasc_recorders.town.drive import REFERENCE_OFFSET_M, concatenate_scans, scan_snapshot
 from crowded import FRAMES as CROWDED_FRAMES
 from crowded import CrowdedDrive
+from manoeuvring import FRAMES as MANOEUVRES_FRAMES
+from manoeuvring import ManoeuvreDrive
 from numpy.typing import NDArray
 from railed import RailedDrive
 from street import StreetDrive
@@ -86,6 +88,7 @@ KINDS = {
     "town": Kind(_town_without_parked_cars, 91, tuple(range(30, 61, 5)), 3, 40),
     "street": Kind(StreetDrive, 91, (30, 45, 60), 3, 40),
     "railed": Kind(RailedDrive, 91, (30, 45, 60), 3, 40),
+    "manoeuvres": Kind(ManoeuvreDrive, MANOEUVRES_FRAMES, (45,), 1, 40),
     "crowded": Kind(CrowdedDrive, CROWDED_FRAMES, (20,), 1, 40),
     "parked": Kind(
         _town, 101, tuple(int(f) for f in np.linspace(0, 100, 10)), 10, 60, movers_only=False

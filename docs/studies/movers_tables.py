@@ -194,6 +194,22 @@ def lidars_to_markdown(tables: list[Table], figure: str) -> str:
     return "\n".join(lines) + "\n"
 
 
+def worst_to_markdown(tables: list[Table]) -> str:
+    """Return the mean and the worst drive of each table by flow and by free space."""
+    lines = ["| LiDAR | motion by | drives | Vehicle | worst | Pedestrian | worst |"]
+    lines += ["|---|---|---:|---:|---:|---:|---:|"]
+    for table in tables:
+        for row in CALIBRATED:
+            if row not in table.rows:
+                continue
+            cells = [table.title, row.removeprefix("align, "), str(len(table.rows[row]))]
+            for figure in ("Vehicle IoU", "Pedestrian IoU"):
+                values = [figures(counts)[figure] for counts in table.rows[row].values()]
+                cells += [f"{np.nanmean(values):.3f}", f"{np.nanmin(values):.2f}"]
+            lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
 def held_out_to_markdown(scores: dict[str, list[dict[str, Any]]]) -> str:
     """Return the table of held-out rays, the mean over drives in percent, from the scores of each
     row and drive.
@@ -224,6 +240,7 @@ def write_tables(tables: list[Table], held_out: dict[str, list[dict[str, Any]]],
             parts.append(table.movers_to_markdown([row for row in MOVERS_OF if row in table.rows]))
             parts += [table.calibration_to_markdown(row) for row in CALIBRATED if row in table.rows]
     if len(tables) > 1:
+        parts.append(worst_to_markdown(tables))
         parts += [
             lidars_to_markdown(tables, name)
             for name in ("Vehicle IoU", "Pedestrian IoU", "Vehicle free")

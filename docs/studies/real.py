@@ -30,7 +30,7 @@ from real_measures import GROW_M, Judge, Measures, Share
 
 import carlasc
 from carlasc import GridSpec, Run
-from carlasc.core import Transform, invert, transform_points
+from carlasc.core import transform_points
 from carlasc.core.frames import FrameRange
 from carlasc.groundtruth import FromScans, Voting
 from carlasc.groundtruth.from_scans.feed import ScanFeed
@@ -129,7 +129,7 @@ def bodies_of(judge: Judge, folder: Path, frames: list[int]) -> Iterator[str]:
                 continue
             track = actors.tracks[number]
             sizes = track.size - 2 * BODY_MARGIN_M, body.upper - body.lower
-            overlaps.append(overlap_above(present[number], pose, *sizes))
+            overlaps.append(study.overlap_above(present[number], pose, *sizes))
             if frame not in grids:
                 continue
             now = feed.instant(frame)
@@ -142,18 +142,6 @@ def bodies_of(judge: Judge, folder: Path, frames: list[int]) -> Iterator[str]:
         good = np.mean(np.array(overlaps) >= 0.5)
         share = Share(outside, own).percent
         yield f"| {body.name} | {np.median(overlaps):.2f} | {good:.0%} | {own} | {share:.1f}% |"
-
-
-def overlap_above(
-    one: Transform, other: Transform, size: NDArray[np.float64], size_2: NDArray[np.float64]
-) -> float:
-    """Return the IoU of two boxes seen from above: poses, and sizes in metres; by samples."""
-    steps = (np.arange(60) + 0.5) / 60 - 0.5
-    samples = np.stack(np.meshgrid(steps, steps, [0.0]), axis=-1).reshape(-1, 3) * size
-    inside = np.abs(transform_points(invert(other) @ one, samples)[:, :2]) < size_2[:2] / 2
-    areas = float(np.prod(size[:2])), float(np.prod(size_2[:2]))
-    shared = float(inside.all(axis=1).mean()) * areas[0]
-    return shared / (sum(areas) - shared)
 
 
 def found_of(archive: Path, found: Sequence) -> dict[int, NDArray[np.int64]]:

@@ -185,22 +185,27 @@ def _queue(
     return movers
 
 
-def build_street(rng: np.random.Generator, houses: tuple[float, ...] = (-1.0, 1.0)) -> Town:
-    """Build what stands along a random street, with houses on one side (y < 0: -1) or both.
+def build_street(
+    rng: np.random.Generator,
+    houses: tuple[float, ...] = (-1.0, 1.0),
+    sidewalks: tuple[float, ...] = (-1.0, 1.0),
+) -> Town:
+    """Build what stands along a random street, with houses on one side (y < 0: -1) or both, and
+    sidewalks with furniture.
 
     World frame: x along the street, y to the right, z up, the road at z = 0.
     """
     plan = TownPlan(rng, PlantCatalogue(rng))
-    _lay_strip(plan, ROAD, (-HALF_ROAD_M, 0.0), (HALF_ROAD_M, 0.0))
+    lay_strip(plan, ROAD, (-HALF_ROAD_M, 0.0), (HALF_ROAD_M, 0.0))
     for y in (-3.5, 0.0, 3.5):
         dashes = np.arange(START_M, END_M, 7.5)
         middles = np.column_stack([dashes, np.full(len(dashes), y), np.full(len(dashes), PAINT_M)])
         plan.builder.level_rectangles(ROAD_LINE, middles, (3.0, 0.15))
-    for side in (-1.0, 1.0):
+    for side in sidewalks:
         kerb, inner = side * HALF_ROAD_M, side * (HALF_ROAD_M + WALK_M)
-        _lay_strip(plan, SIDEWALK, (kerb, -0.05), (kerb, KERB_M))
-        _lay_strip(plan, SIDEWALK, (kerb, KERB_M), (inner, KERB_M))
-        _lay_strip(
+        lay_strip(plan, SIDEWALK, (kerb, -0.05), (kerb, KERB_M))
+        lay_strip(plan, SIDEWALK, (kerb, KERB_M), (inner, KERB_M))
+        lay_strip(
             plan,
             TERRAIN if rng.random() < 0.5 else GROUND,
             (inner, KERB_M),
@@ -212,7 +217,7 @@ def build_street(rng: np.random.Generator, houses: tuple[float, ...] = (-1.0, 1.
     return Town(_NO_STREETS, plan.builder.build(), tuple(plan.buildings), ())
 
 
-def _lay_strip(
+def lay_strip(
     plan: TownPlan, label: int, one: tuple[float, float], other: tuple[float, float]
 ) -> None:
     """Add a surface along the street between two lines, (y, z) each, in tiles of 6 m."""

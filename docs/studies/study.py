@@ -21,6 +21,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.scans import Scan
 from carlasc.metrics import interval_of
 
@@ -115,6 +116,18 @@ def interval(values: Iterable[float], shown: str = ".2f") -> str:
     degrees = len(found) - 1
     bounds = interval_of(float(found.mean()), (found.var(ddof=1) / len(found), degrees))
     return f"{bounds.value:{shown}} ({bounds.low:{shown}} to {bounds.high:{shown}})"
+
+
+def overlap_above(
+    one: Transform, other: Transform, size: NDArray[np.float64], size_2: NDArray[np.float64]
+) -> float:
+    """Return the IoU of two boxes seen from above: poses, and sizes in metres; by samples."""
+    steps = (np.arange(60) + 0.5) / 60 - 0.5
+    samples = np.stack(np.meshgrid(steps, steps, [0.0]), axis=-1).reshape(-1, 3) * size
+    inside = np.abs(transform_points(invert(other) @ one, samples)[:, :2]) < size_2[:2] / 2
+    areas = float(np.prod(size[:2])), float(np.prod(size_2[:2]))
+    shared = float(inside.all(axis=1).mean()) * areas[0]
+    return shared / (sum(areas) - shared)
 
 
 class Clock:

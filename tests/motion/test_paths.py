@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from helpers.scenes.box_actors import PERIOD_S, MovingBox, box_surface, scan_of
 
+from carlasc.core.arrays import FloatArray
 from carlasc.motion.paths import (
     best_observation,
     corrections,
     ends,
     estimate_path,
     follow,
-    headings_by_turns,
+    headings_of_vehicle,
     is_static,
 )
 from carlasc.motion.solving import headings_of
@@ -114,10 +115,41 @@ def test_a_vehicle_in_a_bend_points_where_registration_says():
     motion = turns + 0.3 + np.where(SECONDS > 1.8, 0.09, 0.0) + noise
     velocities = 6 * np.column_stack([np.cos(motion), np.sin(motion), np.zeros(len(SECONDS))])
     by_turns, by_motion = (
-        headings_by_turns(velocities, turns, SECONDS) - turns - 0.3,
+        headings_of_vehicle(velocities, SECONDS, 0.0, turns) - turns - 0.3,
         headings_of(velocities) - turns - 0.3,
     )
     assert np.abs(by_turns[:12]).max() < 0.6 * np.abs(by_motion[:12]).max()
+
+
+def manoeuvre(speeds: FloatArray, rates: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the headings and the velocities of the centre of a vehicle, 5 m long, that turns
+    around a place beside its rear axle.
+    """
+    headings = 0.5 + np.cumsum(rates) * PERIOD_S
+    along, aside = (
+        np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(SECONDS))])
+        for angle in (headings, headings + np.pi / 2)
+    )
+    return headings, speeds[:, None] * along + (rates * 0.3 * 5.0)[:, None] * aside
+
+
+@pytest.mark.parametrize("is_registered", [False, True])
+def test_a_vehicle_that_goes_back_and_forth_keeps_its_front(is_registered):
+    back = SECONDS[-1] / 3 > SECONDS
+    headings, velocities = manoeuvre(np.where(back, -4.0, 4.0), np.where(back, 0.0, 0.5))
+    turns = headings - headings[0] if is_registered else None
+    found = headings_of_vehicle(velocities, SECONDS, 5.0, turns)
+    assert np.abs(np.angle(np.exp(1j * (found - headings)))).mean() < 0.08
+    assert np.abs(np.angle(np.exp(1j * (headings_of(velocities) - headings)))).max() > 2.9
+
+
+def test_registration_shows_that_a_vehicle_is_in_reverse_in_a_bend():
+    rates = np.where(SECONDS[-1] / 2 > SECONDS, 0.0, 0.6)
+    headings, velocities = manoeuvre(np.full(len(SECONDS), -4.0), rates)
+    found = headings_of_vehicle(velocities, SECONDS, 5.0, headings)
+    assert np.abs(np.angle(np.exp(1j * (found - headings)))).mean() < 0.1
+    without = headings_of_vehicle(velocities, SECONDS, 5.0)
+    assert np.abs(np.angle(np.exp(1j * (without - headings)))).min() > 2.5
 
 
 def test_observations_are_laid_on_each_other_near_what_is_known():

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.references.whole_drives import link_segments
+from helpers.scenes.box_actors import MovingBox, scan_of
 
 from carlasc.motion import Segment, StaticPoints
-from carlasc.motion.tracks import is_possible
+from carlasc.motion.tracks import is_possible, make_track
 
 CAR, PERSON = 10, 4
 TIMES = {frame: 0.1 * frame for frame in range(100)}
@@ -181,3 +182,18 @@ def test_what_is_longer_than_any_vehicle_is_several_things_and_does_not_move(len
 )
 def test_one_actor_is_not_larger_than_a_vehicle_in_any_direction(size, possible):
     assert is_possible(size) == possible
+
+
+@pytest.mark.parametrize("turn", [1.5, 3.0, 4.5])
+def test_a_vehicle_that_turns_far_keeps_its_size_and_its_place(turn):
+    """Its path is known except for an offset, and each scan shows the sides that face the sensor."""
+    car = MovingBox((6.0, 4.0, 0.0), speed=3.0, yaw_rate=turn / 4.0)
+    chain = []
+    for frame in range(40):
+        points = scan_of([car], frame, view_from=(0.0, 0.0, 0.5)).points.astype(np.float64)
+        velocity = car.velocity(0.1 * frame)
+        chain.append(Segment(frame, CAR, np.arange(len(points)), points, velocity))
+    track = make_track(chain, TIMES)
+    off = [track.pose(frame)[:2, 3] - car.pose(0.1 * frame)[:2, 3] for frame in range(40)]
+    assert np.linalg.norm(off, axis=1).max() < 0.3
+    assert track.extent.size[:2] == pytest.approx(car.size[:2], abs=0.3)
