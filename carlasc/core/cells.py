@@ -246,6 +246,7 @@ def count_points(
     points: AnyFloatArray,
     grid_T_points: Collection[Transform],
     spec: GridSpec,
+    counts: Int32Array | None = None,
 ) -> Int32Array:
     """Return the number of points per voxel, (V,), which are in several places.
 
@@ -255,8 +256,9 @@ def count_points(
         points: (N, 3) metres.
         grid_T_points: (4, 4), from the frame of the points to that of the grid, for each place.
         spec: geometry of the grid.
+        counts: (V,) numbers to which these are added; None: zeros.
     """
-    counts = np.zeros(spec.num_voxels, np.int32)
+    counts = np.zeros(spec.num_voxels, np.int32) if counts is None else counts
     poses = np.array([*map(as_pose, grid_T_points)]).reshape(-1, 12)
     _count(np.ascontiguousarray(points), poses, Cells.of(spec), counts)
     return counts
@@ -283,9 +285,9 @@ def find_crossing(
     poses: FloatArray,
     box: FloatArray,
     turn: int,
-) -> tuple[IntArray, IntArray]:
-    """Return the (M,) rays that intersect a box, and the (K,) index after the last one of each
-    origin.
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return the (M,) rays that intersect a box, the (K,) index after the last one of each origin,
+    and (M, 3) where these rays end, metres, frame of the box.
 
     Args:
         points: (N, 3) metres, from the origins of the rays.
@@ -296,7 +298,7 @@ def find_crossing(
         box: (2, 3) lower and upper corner, metres.
         turn: number of steps of azimuth in a turn.
     """
-    found, count = np.empty(len(points), np.int64), 0
+    found, places, count = np.empty(len(points), np.int64), np.empty((len(points), 3)), 0
     reached, begin = np.empty(len(ends), np.int64), 0
     for k in range(len(ends)):
         pose, own = pose_of(poses, k), azimuth[begin : ends[k]]
@@ -314,9 +316,10 @@ def find_crossing(
                 end = transform(pose, np.float64(x), np.float64(y), np.float64(z))
                 if _intersects(end, pose, box):
                     found[count] = order[i]
+                    places[count, 0], places[count, 1], places[count, 2] = end
                     count += 1
         begin, reached[k] = ends[k], count
-    return found[:count], reached
+    return found[:count], reached, places[:count]
 
 
 @jit

@@ -206,9 +206,10 @@ class Rays:
 
     def through(
         self, box_T_places: FloatArray, lower: FloatArray, upper: FloatArray
-    ) -> tuple[IntArray, IntArray]:
+    ) -> tuple[IntArray, IntArray, FloatArray]:
         """Return the (M,) indices of the rays, from the origin to the point, that intersect a box,
-        and the (K,) index after the last one of each origin.
+        the (K,) index after the last one of each origin, and the (M, 3) points in the frame of the
+        box, metres.
 
         Args:
             box_T_places: (K, 4, 4), from the frame at each origin to the frame in which the box is

@@ -20,7 +20,7 @@ from carlasc.core.arrays import (
     LabelArray,
     Uint8Array,
 )
-from carlasc.core.cells import as_pose, count_points, joined
+from carlasc.core.cells import count_points, joined
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
@@ -35,7 +35,7 @@ from carlasc.groundtruth.from_scans.merging import (
     passed_by,
 )
 from carlasc.groundtruth.inputs import FrameData, GridPlan
-from carlasc.groundtruth.voting.ballot import Ballot, ClassPoints, Observation, SeenClass, Votes
+from carlasc.groundtruth.voting.ballot import Ballot, Observation, SeenClass, Votes
 from carlasc.groundtruth.voting.certainty import (
     UNKNOWN,
     ClassConsensus,
@@ -179,12 +179,12 @@ def _join_shares(
     return joined[np.argsort(joined["voxel"], kind="stable")]
 
 
-def _are_alone(voxels: IntArray, others: IntArray, spec: GridSpec) -> BoolArray:
-    """Return which of (N,) voxels, flat indices, have none of (M,) other voxels among the 26 around
-    them; they are among the others themselves.
+def _are_alone(voxels: IntArray, returns: Int32Array, spec: GridSpec) -> BoolArray:
+    """Return which of (N,) voxels with returns, flat indices, have none in the 26 around them, from
+    (V,) numbers of returns.
     """
     taken = np.zeros(np.add(spec.size, 2), np.bool_)
-    taken[1:-1, 1:-1, 1:-1].flat[others] = True
+    taken[1:-1, 1:-1, 1:-1] = returns.reshape(spec.size) > 0
     around = sliding_window_view(taken, (3, 3, 3))
     return around[np.unravel_index(voxels, spec.size)].sum(axis=(1, 2, 3)) == 1
 
@@ -217,7 +217,8 @@ def find_above(solid: BoolArray, known: BoolArray, bodies: BoolArray, spec: Grid
 
     roofs = np.full((nx + 2, ny + 2), -1)
     roofs[rows + 1, places + 1] = own = np.where(passed > top, top, -1)[group]
-    roof = sliding_window_view(roofs, (3, 3)).max((2, 3)).reshape(-1)
+    wide = np.maximum(np.maximum(roofs[:-2], roofs[1:-1]), roofs[2:])
+    roof = np.maximum(np.maximum(wide[:, :-2], wide[:, 1:-1]), wide[:, 2:]).reshape(-1)
     roof[columns] = own
     chosen = np.flatnonzero(roof >= 0)
     over = np.arange(levels) - roof[chosen, None]
@@ -304,24 +305,25 @@ class _FrameSteps:
         return self.regions.of_voxel != STATIC
 
     @cached_property
+    def body_voxels(self) -> IntArray:
+        """The voxels of bodies, flat indices, increasing."""
+        return np.flatnonzero(self.in_body)
+
+    @cached_property
     def grid_T_sensor(self) -> dict[int, Transform]:
         """(4, 4) pose of the sensor at each other frame of the window."""
         others = [frame for frame in self.window if frame != self.now.frame]
         return {frame: self.now.grid_T_world @ self.feed.pose(frame) for frame in others}
 
     @cached_property
-    def returned(self) -> tuple[IntArray, Int32Array]:
-        """The voxels with points of the frame's own scan, increasing, and their numbers of points;
-        none if the scan is not merged.
-        """
-        return self._returned(slice(None if self.now.frame in self.window else 0))
+    def returns(self) -> Int32Array:
+        """(V,) points of the own scan in each voxel; 0 if it is not merged."""
+        return self._returns(slice(None if self.now.frame in self.window else 0))
 
-    def _returned(self, chosen: BoolArray | slice) -> tuple[IntArray, Int32Array]:
+    def _returns(self, chosen: BoolArray | slice) -> Int32Array:
         points, now = self.merger.settled(self.now.frame).points[chosen], self.now
         pose = now.grid_T_world @ self.feed.pose(now.frame)
-        counts = count_points(points, [pose], self.plan.spec)
-        voxels = np.flatnonzero(counts)
-        return voxels, counts[voxels]
+        return count_points(points, [pose], self.plan.spec)
 
     def decide_seen(self, votes: Votes, consensus: ClassConsensus | None) -> _UnfinishedGrid:
         """Return the grid from the votes for the static scene and in the bodies of actors, with the
@@ -332,7 +334,8 @@ class _FrameSteps:
         if consensus is not None:
             labels = consensus.labels.copy()
         free = votes.free.reshape(-1)
-        bodies = np.flatnonzero(np.isin(self.regions.of_voxel, list(self.regions.actors)))
+        bodies = self.body_voxels
+        bodies = bodies[np.isin(self.regions.of_voxel[bodies], list(self.regions.actors))]
         # Before `labels` is overwritten by decisions: doubt is about the class that was seen.
         doubtful = self._doubtful(self._evidence(votes, labels, hits, bodies))
         voted = self._evidence(
@@ -369,11 +372,11 @@ class _FrameSteps:
             votes: the votes.
             bodies: what scans saw of each body, as mirror images.
         """
-        inferred = self._evidence(votes, *votes.elect_occupied(), np.flatnonzero(self.in_body))
+        inferred = self._evidence(votes, *votes.elect_occupied(), self.body_voxels)
         # A mirrored side is less certain than a seen one, and has its own calibration.
         inferred.matter[inferred.matter == Matter.BODY] = Matter.MIRRORED
         unseen = np.isin(inferred.voxels, self.regions.hidden_ends) & (inferred.hits == 0)
-        unseen |= np.isin(inferred.voxels, made.passed) | np.isin(inferred.voxels, self.returned[0])
+        unseen |= np.isin(inferred.voxels, made.passed) | (self.returns[inferred.voxels] > 0)
         inferred = inferred.at(
             (made.counts[inferred.voxels] == 0) & (inferred.counts > 0) & ~unseen
         )
@@ -468,11 +471,10 @@ class _FrameSteps:
         """Return the voxels outside of bodies that moving points are in at other times."""
         if self.feed.options.dynamic != "align":
             return _NO_VOXELS
-        voters = [
-            ClassPoints(np.ascontiguousarray(self.merger.moving(frame).T), as_pose(pose))
-            for frame, pose in self.grid_T_sensor.items()
-        ]
-        return np.flatnonzero(self.vote([SeenClass(1, voters)]).hit & ~self.in_body)
+        spec, found = self.plan.spec, np.zeros(self.plan.spec.num_voxels, np.int32)
+        for frame, pose in self.grid_T_sensor.items():
+            count_points(self.merger.moving(frame), [pose], spec, found)
+        return np.flatnonzero((found > 0) & ~self.in_body)
 
     def keep_returns(self, made: _UnfinishedGrid, votes: Votes, consensus: ClassConsensus) -> None:
         """Make voxels with returns of the frame's own scan occupied, unless the returns are
@@ -482,13 +484,13 @@ class _FrameSteps:
             return
         # Other scans may have seen such a voxel free, as a thin object in it stops few rays. A
         # return is an outlier only if very many rays passed; fewer are enough if it is alone.
-        returned, returns = self.returned
+        returns = self.returns
         if self.merger.dynamic == "drop":
-            returned, returns = self._returned(self.merger.static(self.now.frame))
-        is_lost = (made.labels[returned] == 0) & (consensus.labels[returned] > 0)
-        lost = returned[is_lost]
-        is_single = (returns[is_lost] == 1) & _are_alone(lost, returned, self.plan.spec)
-        rows = votes.occupied[np.isin(votes.occupied["voxel"], lost)]
+            returns = self._returns(self.merger.static(self.now.frame))
+        is_lost = (returns > 0) & (made.labels == 0) & (consensus.labels > 0)
+        lost = np.flatnonzero(is_lost)
+        is_single = (returns[lost] == 1) & _are_alone(lost, returns, self.plan.spec)
+        rows = votes.occupied[is_lost[votes.occupied["voxel"]]]
         hits = np.bincount(np.searchsorted(lost, rows["voxel"]), rows["votes"], len(lost))
         free = votes.free.reshape(-1)[lost]
         enough = np.where(is_single, _SINGLE_PER_M, _OUTLIER_PER_M) * self.plan.voting.free_step_m
@@ -519,5 +521,5 @@ class _FrameSteps:
         path = count_points(body, self.grid_T_sensor.values(), self.plan.spec)
         voxels = np.flatnonzero((path > 0) & (made.labels > 0))
         solid = ~self.feed.classes.have_role(made.labels[voxels], "ground")
-        is_there_now = self.in_body[voxels] | np.isin(voxels, self.returned[0])
+        is_there_now = self.in_body[voxels] | (self.returns[voxels] > 0)
         return voxels[solid & ~is_there_now]

@@ -34,7 +34,6 @@ from carlasc.core.geometry import (
     invert,
     moved_back,
     rotate_vectors,
-    transform_each,
     transform_points,
 )
 from carlasc.core.grids import GridSpec
@@ -227,9 +226,9 @@ class PreparedScan:
 
     def through(
         self, track: Track, lower: FloatArray, upper: FloatArray
-    ) -> tuple[IntArray, IntArray, FloatArray] | None:
-        """Return the (M,) rays that intersect a box, the (K,) index after the last one of each
-        origin, and (K, 4, 4) actor_T_places; None if the track does not extend to the scan.
+    ) -> tuple[IntArray, FloatArray, Cast] | None:
+        """Return the (M,) rays that intersect a box, where they end, (M, 3) metres, frame of the
+        actor, and their cast; None if the track does not extend to the scan.
 
         Args:
             track: the actor, which is where it was at the time of the rays.
@@ -240,7 +239,9 @@ class PreparedScan:
         if poses is None:
             return None
         actor_T_places = invert(poses) @ self.world_T_sensor @ self.rays.sensor_T_places
-        return *self.rays.through(actor_T_places, lower, upper), actor_T_places
+        rays, ends, places = self.rays.through(actor_T_places, lower, upper)
+        cast = Cast(self.rays.points[rays], ends, actor_T_places, lower, upper)
+        return rays, places, cast
 
     def at_frame(self, tracks: Iterable[Track]) -> PreparedScan:
         """Return the scan with the points of tracks where they are at the time of the frame."""
@@ -307,6 +308,7 @@ class Merger:
         self.scan_of, self.actors, self.classes, self.dynamic = scan_of, actors, classes, dynamic
         # of each scan, by its frame; then of its points by class, in its own grid or in others, and
         # of what it saw of each actor
+        self._settled: PreparedScan | None = None  # of the frame that was asked for last
         self._static = dict[int, tuple[BoolArray, BoolArray]]()
         self._labels = dict[int, Uint16Array]()
         self._moving = dict[int, Float32Array]()
@@ -392,7 +394,9 @@ class Merger:
 
     def settled(self, frame: int) -> PreparedScan:
         """Return a scan with the points of actors where they are at the time of the frame."""
-        return self.scan_of(frame).at_frame(self.actors.tracks.values())
+        if self._settled is None or self._settled.frame != frame:
+            self._settled = self.scan_of(frame).at_frame(self.actors.tracks.values())
+        return self._settled
 
     def moving(self, frame: int) -> Float32Array:
         """Return the (M, 3) moving points of a scan, metres, sensor frame."""
@@ -441,9 +445,7 @@ class Merger:
                 found = scan.through(track, np.minimum(lower, least), np.maximum(upper, most))
                 if found is None:
                     continue
-                near, ends, places = found
-                poses = np.repeat(places, np.diff(ends, prepend=0), axis=0)
-                body = transform_each(poses, scan.rays.points[near])
+                near, body, _ = found
                 inside = ((body >= lower) & (body <= upper)).all(axis=1) & ~ground[near]
                 below = ((body >= least) & (body <= most)).all(axis=1) & ground[near]
                 static[near[inside]], under[near[below]] = False, True
@@ -478,17 +480,12 @@ class Merger:
             return None
         kept = self._carried[other]
         if number not in kept:
-            scan, body = self.scan_of(other), (track.lower, track.upper)
-            found = scan.through(track, *body)
+            found = self.scan_of(other).through(track, track.lower, track.upper)
             if found is not None and len(found[0]):
-                rays, ends, places = found
-                own = np.zeros(len(scan.points), np.bool_)
-                own[track.members.get(other, [])] = True
-                points = scan.rays.points[rays]
-                seen, poses = own[rays], np.repeat(places, np.diff(ends, prepend=0), axis=0)
-                hits = transform_each(poses[seen], points[seen]).astype(np.float32)
-                cast = Cast(points, ends, places, *body)
-                kept[number] = _Carried(cast, np.ascontiguousarray(hits.T))
+                rays, places, cast = found
+                seen = np.isin(rays, track.members.get(other, []))
+                points = np.ascontiguousarray(places[seen].astype(np.float32).T)
+                kept[number] = _Carried(cast, points)
         return kept.setdefault(number, None)
 
 
