@@ -303,13 +303,12 @@ def find_crossing(
     for k in range(len(ends)):
         pose, own = pose_of(poses, k), azimuth[begin : ends[k]]
         middle, half = _seen_from(pose, box)
-        low, high, laps = 0.0, float(turn), 1  # all rays, if the corners surround the origin
+        low, high = 0.0, turn - 1.0  # all rays, if the corners surround the origin
         if half <= math.pi / 2:
-            to_steps, laps = turn / (2 * math.pi), 3
+            to_steps = turn / (2 * math.pi)
             low = math.floor((middle - half + math.pi) * to_steps) - 1.0
             high = math.ceil((middle + half + math.pi) * to_steps) + 1.0
-        for lap in range(laps):
-            more = lap * turn if lap < 2 else -turn
+        for more in (-turn, 0, turn):  # a full circle has an azimuth at both ends
             first = begin + np.searchsorted(own, low + more)
             for i in range(first, begin + np.searchsorted(own, high + more + 1.0)):
                 x, y, z = points[order[i]]

@@ -100,17 +100,6 @@ class Track:
         row = frame - self.first
         return self.world_T_actor[row] if 0 <= row < len(self.world_T_actor) else None
 
-    def poses_after(self, frame: int, seconds: FloatArray) -> FloatArray | None:
-        """Return (K, 4, 4) world_T_actor at K times after a frame, less than a frame; None if the
-        track does not extend to it.
-        """
-        row = frame - self.first
-        if not 0 <= row < len(self.world_T_actor):
-            return None
-        poses = np.repeat(self.world_T_actor[row][None], len(seconds), axis=0)
-        poses[:, :3, 3] += self.velocity[row] * seconds[:, None]
-        return poses
-
     def velocity_at(self, frame: int) -> FloatArray | None:
         """Return (3,) m/s, world, at a frame; None if the track does not extend to it."""
         row = frame - self.first

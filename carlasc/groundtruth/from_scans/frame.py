@@ -305,11 +305,6 @@ class _FrameSteps:
         return self.regions.of_voxel != STATIC
 
     @cached_property
-    def body_voxels(self) -> IntArray:
-        """The voxels of bodies, flat indices, increasing."""
-        return np.flatnonzero(self.in_body)
-
-    @cached_property
     def grid_T_sensor(self) -> dict[int, Transform]:
         """(4, 4) pose of the sensor at each other frame of the window."""
         others = [frame for frame in self.window if frame != self.now.frame]
@@ -334,7 +329,7 @@ class _FrameSteps:
         if consensus is not None:
             labels = consensus.labels.copy()
         free = votes.free.reshape(-1)
-        bodies = self.body_voxels
+        bodies = np.flatnonzero(self.in_body)
         bodies = bodies[np.isin(self.regions.of_voxel[bodies], list(self.regions.actors))]
         # Before `labels` is overwritten by decisions: doubt is about the class that was seen.
         doubtful = self._doubtful(self._evidence(votes, labels, hits, bodies))
@@ -372,7 +367,7 @@ class _FrameSteps:
             votes: the votes.
             bodies: what scans saw of each body, as mirror images.
         """
-        inferred = self._evidence(votes, *votes.elect_occupied(), self.body_voxels)
+        inferred = self._evidence(votes, *votes.elect_occupied(), np.flatnonzero(self.in_body))
         # A mirrored side is less certain than a seen one, and has its own calibration.
         inferred.matter[inferred.matter == Matter.BODY] = Matter.MIRRORED
         unseen = np.isin(inferred.voxels, self.regions.hidden_ends) & (inferred.hits == 0)

@@ -235,13 +235,14 @@ class PreparedScan:
             lower: (3,) lower corner of the box, metres, frame of the actor.
             upper: (3,) upper corner.
         """
-        poses = track.poses_after(self.frame, self.rays.seconds)
-        if poses is None:
+        pose, velocity = track.pose(self.frame), track.velocity_at(self.frame)
+        if pose is None or velocity is None:
             return None
+        poses = np.repeat(pose[None], len(self.rays.ends), axis=0)
+        poses[:, :3, 3] += velocity * self.rays.seconds[:, None]
         actor_T_places = invert(poses) @ self.world_T_sensor @ self.rays.sensor_T_places
-        rays, ends, places = self.rays.through(actor_T_places, lower, upper)
-        cast = Cast(self.rays.points[rays], ends, actor_T_places, lower, upper)
-        return rays, places, cast
+        rays, ends, body = self.rays.through(actor_T_places, lower, upper)
+        return rays, body, Cast(self.rays.points[rays], ends, actor_T_places, lower, upper)
 
     def at_frame(self, tracks: Iterable[Track]) -> PreparedScan:
         """Return the scan with the points of tracks where they are at the time of the frame."""
@@ -308,7 +309,6 @@ class Merger:
         self.scan_of, self.actors, self.classes, self.dynamic = scan_of, actors, classes, dynamic
         # of each scan, by its frame; then of its points by class, in its own grid or in others, and
         # of what it saw of each actor
-        self._settled: PreparedScan | None = None  # of the frame that was asked for last
         self._static = dict[int, tuple[BoolArray, BoolArray]]()
         self._labels = dict[int, Uint16Array]()
         self._moving = dict[int, Float32Array]()
@@ -394,9 +394,7 @@ class Merger:
 
     def settled(self, frame: int) -> PreparedScan:
         """Return a scan with the points of actors where they are at the time of the frame."""
-        if self._settled is None or self._settled.frame != frame:
-            self._settled = self.scan_of(frame).at_frame(self.actors.tracks.values())
-        return self._settled
+        return self.scan_of(frame).at_frame(self.actors.tracks.values())
 
     def moving(self, frame: int) -> Float32Array:
         """Return the (M, 3) moving points of a scan, metres, sensor frame."""
