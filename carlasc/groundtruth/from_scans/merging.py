@@ -260,17 +260,9 @@ class PreparedScan:
         return replace(self, points=points, ends=ends)
 
 
-@dataclass(frozen=True)
-class _Carried:
-    """What a scan saw of the body of an actor, in the frame of the actor.
-
-    Attributes:
-        cast: the rays through the body.
-        points: (3, M) float32, metres, the points of the actor.
-    """
-
-    cast: Cast
-    points: Float32Array
+# what a scan saw of the body of an actor: the rays through it, and (3, M) points of the actor,
+# metres, both in the frame of the actor
+_Carried = tuple[Cast, Float32Array]
 
 
 class SeenBody(NamedTuple):
@@ -386,8 +378,8 @@ class Merger:
                 if mirror or other != now.frame:
                     carried = self._carry(number, other, now)
                     if carried is not None:
-                        casts[other] = carried.cast
-                        points.append(ClassPoints(carried.points, grid_T_actor))
+                        casts[other], seen = carried
+                        points.append(ClassPoints(seen, grid_T_actor))
             if casts:
                 votes = SeenClass(track.label, points, regions.of_voxel, region)
                 yield SeenBody(number, pose, casts, votes)
@@ -482,8 +474,7 @@ class Merger:
             if found is not None and len(found[0]):
                 rays, places, cast = found
                 seen = np.isin(rays, track.members.get(other, []))
-                points = np.ascontiguousarray(places[seen].astype(np.float32).T)
-                kept[number] = _Carried(cast, points)
+                kept[number] = cast, np.ascontiguousarray(places[seen].astype(np.float32).T)
         return kept.setdefault(number, None)
 
 
