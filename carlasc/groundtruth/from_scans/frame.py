@@ -217,8 +217,8 @@ def find_above(solid: BoolArray, known: BoolArray, bodies: BoolArray, spec: Grid
 
     roofs = np.full((nx + 2, ny + 2), -1)
     roofs[rows + 1, places + 1] = own = np.where(passed > top, top, -1)[group]
-    wide = np.maximum(np.maximum(roofs[:-2], roofs[1:-1]), roofs[2:])
-    roof = np.maximum(np.maximum(wide[:, :-2], wide[:, 1:-1]), wide[:, 2:]).reshape(-1)
+    wide = np.maximum.reduce([roofs[:-2], roofs[1:-1], roofs[2:]])
+    roof = np.maximum.reduce([wide[:, :-2], wide[:, 1:-1], wide[:, 2:]]).reshape(-1)
     roof[columns] = own
     chosen = np.flatnonzero(roof >= 0)
     over = np.arange(levels) - roof[chosen, None]
@@ -466,7 +466,8 @@ class _FrameSteps:
         """Return the voxels outside of bodies that moving points are in at other times."""
         if self.feed.options.dynamic != "align":
             return _NO_VOXELS
-        spec, found = self.plan.spec, np.zeros(self.plan.spec.num_voxels, np.int32)
+        spec = self.plan.spec
+        found = np.zeros(spec.num_voxels, np.int32)
         for frame, pose in self.grid_T_sensor.items():
             count_points(self.merger.moving(frame), [pose], spec, found)
         return np.flatnonzero((found > 0) & ~self.in_body)
@@ -479,9 +480,9 @@ class _FrameSteps:
             return
         # Other scans may have seen such a voxel free, as a thin object in it stops few rays. A
         # return is an outlier only if very many rays passed; fewer are enough if it is alone.
-        returns = self.returns
-        if self.merger.dynamic == "drop":
-            returns = self._returns(self.merger.static(self.now.frame))
+        merger, returns = self.merger, self.returns
+        if merger.dynamic == "drop":
+            returns = self._returns(merger.static(self.now.frame))
         is_lost = (returns > 0) & (made.labels == 0) & (consensus.labels > 0)
         lost = np.flatnonzero(is_lost)
         is_single = (returns[lost] == 1) & _are_alone(lost, returns, self.plan.spec)
