@@ -179,12 +179,12 @@ def _join_shares(
     return joined[np.argsort(joined["voxel"], kind="stable")]
 
 
-def _are_alone(voxels: IntArray, returns: Int32Array, spec: GridSpec) -> BoolArray:
-    """Return which of (N,) voxels with returns, flat indices, have none in the 26 around them, from
-    (V,) numbers of returns.
+def _are_alone(voxels: IntArray, others: IntArray, spec: GridSpec) -> BoolArray:
+    """Return which of (N,) voxels, flat indices, have none of (M,) other voxels among the 26 around
+    them; they are among the others themselves.
     """
     taken = np.zeros(np.add(spec.size, 2), np.bool_)
-    taken[1:-1, 1:-1, 1:-1] = returns.reshape(spec.size) > 0
+    taken[1:-1, 1:-1, 1:-1].flat[others] = True
     around = sliding_window_view(taken, (3, 3, 3))
     return around[np.unravel_index(voxels, spec.size)].sum(axis=(1, 2, 3)) == 1
 
@@ -311,14 +311,18 @@ class _FrameSteps:
         return {frame: self.now.grid_T_world @ self.feed.pose(frame) for frame in others}
 
     @cached_property
-    def returns(self) -> Int32Array:
-        """(V,) points of the own scan in each voxel; 0 if it is not merged."""
-        return self._returns(slice(None if self.now.frame in self.window else 0))
+    def returned(self) -> tuple[IntArray, Int32Array]:
+        """The voxels with points of the frame's own scan, increasing, and their numbers of points;
+        none if the scan is not merged.
+        """
+        return self._returned(slice(None if self.now.frame in self.window else 0))
 
-    def _returns(self, chosen: BoolArray | slice) -> Int32Array:
+    def _returned(self, chosen: BoolArray | slice) -> tuple[IntArray, Int32Array]:
         points, now = self.merger.settled(self.now.frame).points[chosen], self.now
         pose = now.grid_T_world @ self.feed.pose(now.frame)
-        return count_points(points, [pose], self.plan.spec)
+        counts = count_points(points, [pose], self.plan.spec)
+        voxels = np.flatnonzero(counts)
+        return voxels, counts[voxels]
 
     def decide_seen(self, votes: Votes, consensus: ClassConsensus | None) -> _UnfinishedGrid:
         """Return the grid from the votes for the static scene and in the bodies of actors, with the
@@ -371,7 +375,7 @@ class _FrameSteps:
         # A mirrored side is less certain than a seen one, and has its own calibration.
         inferred.matter[inferred.matter == Matter.BODY] = Matter.MIRRORED
         unseen = np.isin(inferred.voxels, self.regions.hidden_ends) & (inferred.hits == 0)
-        unseen |= np.isin(inferred.voxels, made.passed) | (self.returns[inferred.voxels] > 0)
+        unseen |= np.isin(inferred.voxels, made.passed) | np.isin(inferred.voxels, self.returned[0])
         inferred = inferred.at(
             (made.counts[inferred.voxels] == 0) & (inferred.counts > 0) & ~unseen
         )
@@ -480,13 +484,13 @@ class _FrameSteps:
             return
         # Other scans may have seen such a voxel free, as a thin object in it stops few rays. A
         # return is an outlier only if very many rays passed; fewer are enough if it is alone.
-        merger, returns = self.merger, self.returns
-        if merger.dynamic == "drop":
-            returns = self._returns(merger.static(self.now.frame))
-        is_lost = (returns > 0) & (made.labels == 0) & (consensus.labels > 0)
-        lost = np.flatnonzero(is_lost)
-        is_single = (returns[lost] == 1) & _are_alone(lost, returns, self.plan.spec)
-        rows = votes.occupied[is_lost[votes.occupied["voxel"]]]
+        returned, returns = self.returned
+        if self.merger.dynamic == "drop":
+            returned, returns = self._returned(self.merger.static(self.now.frame))
+        is_lost = (made.labels[returned] == 0) & (consensus.labels[returned] > 0)
+        lost = returned[is_lost]
+        is_single = (returns[is_lost] == 1) & _are_alone(lost, returned, self.plan.spec)
+        rows = votes.occupied[np.isin(votes.occupied["voxel"], lost)]
         hits = np.bincount(np.searchsorted(lost, rows["voxel"]), rows["votes"], len(lost))
         free = votes.free.reshape(-1)[lost]
         enough = np.where(is_single, _SINGLE_PER_M, _OUTLIER_PER_M) * self.plan.voting.free_step_m
@@ -515,7 +519,8 @@ class _FrameSteps:
         axes = [np.arange(a, b + 1e-9, apart) for a, b in zip(_OWN_LOWER, _OWN_UPPER, strict=True)]
         body = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
         path = count_points(body, self.grid_T_sensor.values(), self.plan.spec)
-        voxels = np.flatnonzero((path > 0) & (made.labels > 0))
+        voxels = np.flatnonzero(path)
+        voxels = voxels[made.labels[voxels] > 0]
         solid = ~self.feed.classes.have_role(made.labels[voxels], "ground")
-        is_there_now = self.in_body[voxels] | (self.returns[voxels] > 0)
+        is_there_now = self.in_body[voxels] | np.isin(voxels, self.returned[0])
         return voxels[solid & ~is_there_now]
