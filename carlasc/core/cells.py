@@ -25,6 +25,7 @@ from carlasc.core.arrays import (
     FloatArray,
     Int32Array,
     IntArray,
+    Uint16Array,
 )
 from carlasc.core.compiling import cached, fused, inlined, jit
 from carlasc.core.geometry import Transform
@@ -245,6 +246,7 @@ def count_points(
     points: AnyFloatArray,
     grid_T_points: Collection[Transform],
     spec: GridSpec,
+    counts: Int32Array | None = None,
 ) -> Int32Array:
     """Return the number of points per voxel, (V,), which are in several places.
 
@@ -254,8 +256,9 @@ def count_points(
         points: (N, 3) metres.
         grid_T_points: (4, 4), from the frame of the points to that of the grid, for each place.
         spec: geometry of the grid.
+        counts: (V,) numbers to which these are added; None: zeros.
     """
-    counts = np.zeros(spec.num_voxels, np.int32)
+    counts = np.zeros(spec.num_voxels, np.int32) if counts is None else counts
     poses = np.array([*map(as_pose, grid_T_points)]).reshape(-1, 12)
     _count(np.ascontiguousarray(points), poses, Cells.of(spec), counts)
     return counts
@@ -274,35 +277,85 @@ def _count(points: AnyFloatArray, poses: FloatArray, cells: Cells, counts: Int32
 
 
 @cached
-def select_crossing(
+def find_crossing(
     points: Float32Array,
-    chosen: Int32Array,
-    pose: Pose,
-    lower: Triple,
-    upper: Triple,
-    crosses: BoolArray,
-) -> None:
-    """Find which rays, from the origin to a point, intersect a box.
+    order: Int32Array,
+    azimuth: Uint16Array,
+    ends: IntArray,
+    poses: FloatArray,
+    box: FloatArray,
+    turn: int,
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return the (M,) rays that intersect a box, the (K,) index after the last one of each origin,
+    and (M, 3) where these rays end, metres, frame of the box.
 
     Args:
-        points: (N, 3) metres.
-        chosen: (M,) indices of the points.
-        pose: box_T_points, to the frame in which the box is axis-aligned.
-        lower: lower corner of the box.
-        upper: its upper corner.
-        crosses: (M,) output.
+        points: (N, 3) metres, from the origins of the rays.
+        order: (N,) the rays of each origin by increasing azimuth.
+        azimuth: (N,) their azimuths, in steps.
+        ends: (K,) index after the last ray of each origin.
+        poses: (K, 12), from the frame at each origin to that in which the box is axis-aligned.
+        box: (2, 3) lower and upper corner, metres.
+        turn: number of steps of azimuth in a turn.
     """
-    for i in range(len(chosen)):
-        x, y, z = points[chosen[i]]
-        ends = transform(pose, np.float64(x), np.float64(y), np.float64(z))
-        enter, leave = -math.inf, math.inf
-        for axis in range(3):
-            origin = pose[4 * axis + 3]
-            along = ends[axis] - origin
-            one, other = (lower[axis] - origin) / along, (upper[axis] - origin) / along
-            # A ray in the plane of a face gives 0/0: fmin and fmax ignore the NaN.
-            enter, leave = max(enter, np.fmin(one, other)), min(leave, np.fmax(one, other))
-        crosses[i] = (enter <= leave) & (leave >= 0.0) & (enter <= 1.0)
+    found, places, count = np.empty(len(points), np.int64), np.empty((len(points), 3)), 0
+    reached, begin = np.empty(len(ends), np.int64), 0
+    for k in range(len(ends)):
+        pose, own = pose_of(poses, k), azimuth[begin : ends[k]]
+        middle, half = _seen_from(pose, box)
+        low, high = 0.0, turn - 1.0  # all rays, if the corners surround the origin
+        if half <= math.pi / 2:
+            to_steps = turn / (2 * math.pi)
+            low = math.floor((middle - half + math.pi) * to_steps) - 1.0
+            high = math.ceil((middle + half + math.pi) * to_steps) + 1.0
+        for more in (-turn, 0, turn):  # a full circle has an azimuth at both ends
+            first = begin + np.searchsorted(own, low + more)
+            for i in range(first, begin + np.searchsorted(own, high + more + 1.0)):
+                x, y, z = points[order[i]]
+                end = transform(pose, np.float64(x), np.float64(y), np.float64(z))
+                if _intersects(end, pose, box):
+                    found[count] = order[i]
+                    places[count, 0], places[count, 1], places[count, 2] = end
+                    count += 1
+        begin, reached[k] = ends[k], count
+    return found[:count], reached, places[:count]
+
+
+@jit
+def _seen_from(pose: Pose, box: FloatArray) -> tuple[float, float]:
+    """Return the middle and half the width of the range of azimuths that a box covers, radians,
+    from the origin of a frame; the width is infinite if the origin is above, below or inside.
+
+    Args:
+        pose: box_T_origin.
+        box: (2, 3) lower and upper corner.
+    """
+    if box[0, 0] < pose[3] < box[1, 0] and box[0, 1] < pose[7] < box[1, 1]:
+        return 0.0, math.inf
+    angles, sine, cosine, half = np.empty(8), 0.0, 0.0, 0.0
+    for corner in range(8):
+        x, y = box[corner & 1, 0] - pose[3], box[corner >> 1 & 1, 1] - pose[7]
+        z = box[corner >> 2, 2] - pose[11]
+        along = pose[0] * x + pose[4] * y + pose[8] * z
+        angles[corner] = math.atan2(pose[1] * x + pose[5] * y + pose[9] * z, along)
+        sine, cosine = sine + math.sin(angles[corner]), cosine + math.cos(angles[corner])
+    middle = math.atan2(sine, cosine)
+    for angle in angles:
+        half = max(half, abs((angle - middle + math.pi) % (2 * math.pi) - math.pi))
+    return middle, half + 1e-6
+
+
+@jit
+def _intersects(end: Triple, pose: Pose, box: FloatArray) -> bool:
+    """Return whether a ray intersects a box, from the origin of a pose to its end."""
+    enter, leave = -math.inf, math.inf
+    for axis in range(3):
+        origin = pose[4 * axis + 3]
+        along = end[axis] - origin
+        one, other = (box[0, axis] - origin) / along, (box[1, axis] - origin) / along
+        # A ray in the plane of a face gives 0/0: fmin and fmax ignore the NaN.
+        enter, leave = max(enter, np.fmin(one, other)), min(leave, np.fmax(one, other))
+    return (enter <= leave) & (leave >= 0.0) & (enter <= 1.0)
 
 
 def warped_voxels(

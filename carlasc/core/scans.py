@@ -24,7 +24,7 @@ from carlasc.core.arrays import (
     Uint32Array,
 )
 from carlasc.core.boxes import Boxes, mirror_boxes
-from carlasc.core.geometry import Transform, invert, mirror_points, transform_points, translation
+from carlasc.core.geometry import mirror_points, translation
 from carlasc.core.grids import GridSpec
 from carlasc.core.notebook import describe
 from carlasc.errors import FormatError, check_types, count
@@ -35,9 +35,6 @@ from carlasc.errors import FormatError, check_types, count
 _CENTRE, _CENTRE_M, _STANDING, _NEARER = 0.4, 1.0, 0.2, 1.3
 _SAMPLE = 4000  # points of a scan that tell it
 
-_UPPER = (
-    np.indices((2, 2, 2)).reshape(3, -1).T > 0
-)  # which corners of a box are at its upper bounds
 _TURN = 65_000  # steps of azimuth per turn, of about 0.1 mrad; they fit into 16 bits
 
 
@@ -171,82 +168,60 @@ def _starts(origins: AnyFloatArray) -> IntArray:
 
 
 @dataclass(frozen=True)
-class RaysFromPlace:
-    """The rays of a scan with one common origin.
+class Rays:
+    """The rays of a scan, from K origins and times: several for several sensors, or a sensor that
+    moves or turns during the scan.
 
     Attributes:
-        part: slice of the points of the scan at which these rays end.
-        sensor_T_place: (4, 4), from the frame at the ray origin, with the axes of the sensor, to
+        points: (N, 3) float32, where the rays end, relative to their origins, metres.
+        ends: (K,) index after the last ray of each origin.
+        sensor_T_places: (K, 4, 4), from the frame at each origin, with the axes of the sensor, to
             the sensor frame.
-        points: (M, 3) float32, these points relative to the ray origin, metres.
-        order: (M,) int32, indices of `points` by increasing azimuth.
-        azimuth: (M,) uint16, sorted azimuths from -pi, in steps; a full circle has `_TURN` steps.
-        seconds: time of these rays after that of the scan.
+        seconds: (K,) time of the rays after that of the scan.
+        order: (N,) int32, the rays of each origin by increasing azimuth.
+        azimuth: (N,) uint16, their azimuths from -pi, in steps; a full circle has `_TURN` steps.
     """
 
-    part: slice
-    sensor_T_place: Transform
     points: Float32Array
+    ends: IntArray
+    sensor_T_places: FloatArray
+    seconds: FloatArray
     order: Int32Array
     azimuth: Uint16Array
-    seconds: float = 0.0
 
     @classmethod
-    def of(cls, points: Float32Array, part: slice, origin: AnyFloatArray) -> RaysFromPlace:
-        """Return the rays from `origin`, (3,) metres or (4,) with their time, to a part of the
-        (N, 3) points of a scan, given relative to the origin.
+    def of(cls, points: Float32Array, origins: AnyFloatArray | None) -> Rays:
+        """Return the rays to (N, 3) points, given relative to their origins: see
+        `runs_of_origins`.
         """
-        own = points[part]
-        azimuth = _steps(np.arctan2(own[:, 1], own[:, 0])).astype(np.uint16)
+        runs = runs_of_origins(origins, len(points))
+        azimuth = _steps(np.arctan2(points[:, 1], points[:, 0])).astype(np.uint16)
         # a radix sort, because they have 16 bits
-        order = np.argsort(azimuth, kind="stable").astype(np.int32)
-        seconds = float(origin[3:].sum())
-        return cls(part, translation(origin[:3]), own, order, azimuth[order], seconds)
+        order = [part.start + np.argsort(azimuth[part], kind="stable") for part, _ in runs]
+        rays = np.concatenate(order).astype(np.int32)
+        ends = np.array([part.stop for part, _ in runs])
+        places = np.stack([translation(origin[:3]) for _, origin in runs])
+        seconds = np.array([float(origin[3:].sum()) for _, origin in runs])
+        return cls(points, ends, places, seconds, rays, azimuth[rays])
 
-    def through(self, box_T_sensor: Transform, lower: FloatArray, upper: FloatArray) -> Int32Array:
-        """Return the indices of the points whose rays, from the origin to the point, intersect a
-        box.
+    def through(
+        self, box_T_places: FloatArray, lower: FloatArray, upper: FloatArray
+    ) -> tuple[IntArray, IntArray, FloatArray]:
+        """Return the (M,) indices of the rays, from the origin to the point, that intersect a box,
+        the (K,) index after the last one of each origin, and the (M, 3) points in the frame of the
+        box, metres.
 
         Args:
-            box_T_sensor: (4, 4), from the frame of `points` to the frame in which the box is
+            box_T_places: (K, 4, 4), from the frame at each origin to the frame in which the box is
                 axis-aligned.
             lower: (3,) lower corner.
             upper: (3,) upper corner.
         """
-        from carlasc.core.cells import as_pose, select_crossing
+        from carlasc.core.cells import find_crossing
 
-        candidates = self._in_view_of(box_T_sensor, lower, upper)
-        pose, box = as_pose(box_T_sensor), (tuple(lower.tolist()), tuple(upper.tolist()))
-        crosses = np.empty(len(candidates), np.bool_)
-        select_crossing(self.points, candidates, pose, *box, crosses)
-        return candidates[crosses]
-
-    def _in_view_of(
-        self, box_T_sensor: Transform, lower: FloatArray, upper: FloatArray
-    ) -> Int32Array:
-        """Return the indices of the points in the range of azimuths that a box covers."""
-        origin = box_T_sensor[:3, 3]
-        # the sensor is above, below or inside the box
-        if ((origin > lower) & (origin < upper))[:2].all():
-            return self.order
-        seen = transform_points(invert(box_T_sensor), np.where(_UPPER, upper, lower))
-        angles = np.arctan2(seen[:, 1], seen[:, 0])
-        middle = np.arctan2(np.sin(angles).sum(), np.cos(angles).sum())
-        half = np.abs((angles - middle + np.pi) % (2 * np.pi) - np.pi).max() + 1e-6
-        if half > np.pi / 2:  # the corners surround the sensor
-            return self.order
-        low, high = np.floor(_steps(middle - half)) - 1, np.ceil(_steps(middle + half)) + 1
-        parts = [
-            self.order[
-                slice(
-                    *np.searchsorted(
-                        self.azimuth, np.clip([low + turn, high + turn + 1], 0, _TURN + 1)
-                    )
-                )
-            ]
-            for turn in (0, _TURN, -_TURN)
-        ]
-        return np.concatenate(parts)
+        rays = self.points, self.order, self.azimuth, self.ends
+        poses = np.ascontiguousarray(box_T_places[:, :3]).reshape(-1, 12)
+        return find_crossing(*rays, poses, np.stack([lower, upper]), _TURN)
 
 
 def _steps(azimuth_rad: Any) -> Any:

@@ -285,7 +285,8 @@ class FrameFacts:
             seen = np.asarray(counts).reshape(-1)
             known = seen > 0
             labels, seen = labels[known], seen[known]
-            powers = np.clip(np.frexp(seen.astype(np.float32))[1] - 1, 0, POWERS - 1)
+            # the exponents of float32: several times faster than `frexp`
+            powers = np.clip((seen.astype(np.float32).view(np.int32) >> 23) - 127, 0, POWERS - 1)
             votes, votes_sum = (
                 np.bincount(powers, minlength=POWERS),
                 float(seen.sum(dtype=np.float64)),

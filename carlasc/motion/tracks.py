@@ -28,7 +28,6 @@ from carlasc.core.geometry import (
     rotate_vectors,
     rotation_z,
     transform_each,
-    translation,
 )
 from carlasc.errors import reading
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent, Sizes, measure, surface_of
@@ -105,15 +104,10 @@ class Track:
     surface: Float32Array = field(default_factory=lambda: np.empty((0, 3), np.float32))
     confidence: float = 1.0
 
-    def pose(self, frame: int, after_s: float = 0.0) -> Transform | None:
-        """Return (4, 4) world_T_actor some seconds after a frame, less than a frame; None if the
-        track does not extend to it.
-        """
+    def pose(self, frame: int) -> Transform | None:
+        """Return (4, 4) world_T_actor at a frame; None if the track does not extend to it."""
         row = frame - self.first
-        if not 0 <= row < len(self.world_T_actor):
-            return None
-        pose = self.world_T_actor[row]
-        return translation(self.velocity[row] * after_s) @ pose if after_s else pose
+        return self.world_T_actor[row] if 0 <= row < len(self.world_T_actor) else None
 
     def velocity_at(self, frame: int) -> FloatArray | None:
         """Return (3,) m/s, world, at a frame; None if the track does not extend to it."""

@@ -278,11 +278,8 @@ def around(turn, points):
     """
     turned = transform_points(rotation_z(turn), np.array(points, float)).astype(np.float32)
     scan = PreparedScan.of(0, turned, np.ones(len(turned), np.uint16), np.eye(4))
-    return (
-        scan.rays[0]
-        .through(rotation_z(-turn), np.array([4.0, -1.0, -1.0]), np.array([6.0, 1.0, 1.0]))
-        .tolist()
-    )
+    box = np.array([4.0, -1.0, -1.0]), np.array([6.0, 1.0, 1.0])
+    return scan.rays.through(rotation_z(-turn)[None], *box)[0].tolist()
 
 
 @pytest.mark.parametrize("turn", np.linspace(-np.pi, np.pi, 9))
@@ -303,18 +300,18 @@ def test_rays_through_a_box_end_in_it_or_behind_it(turn):
 def test_a_box_around_below_or_beside_the_sensor_is_seen_whole():
     points = np.array([(5, 0, -2), (-5, 0, -2), (0, 5, -2), (0, -5, -2)], np.float32)
     scan = PreparedScan.of(0, points, np.ones(4, np.uint16), np.eye(4))
-    below = scan.rays[0].through(
-        np.eye(4), np.array([-6.0, -6.0, -3.0]), np.array([6.0, 6.0, -1.0])
+    below = scan.rays.through(
+        np.eye(4)[None], np.array([-6.0, -6.0, -3.0]), np.array([6.0, 6.0, -1.0])
     )
-    assert sorted(below.tolist()) == [0, 1, 2, 3]
-    beside = scan.rays[0].through(
-        np.eye(4), np.array([-6.0, 0.1, -3.0]), np.array([6.0, 6.0, -1.0])
+    assert sorted(below[0].tolist()) == [0, 1, 2, 3]
+    beside = scan.rays.through(
+        np.eye(4)[None], np.array([-6.0, 0.1, -3.0]), np.array([6.0, 6.0, -1.0])
     )
-    assert beside.tolist() == [2]
-    corner = scan.rays[0].through(
-        np.eye(4), np.array([-6.0, -0.1, -3.0]), np.array([-0.1, 0.1, -1.0])
+    assert beside[0].tolist() == [2]
+    corner = scan.rays.through(
+        np.eye(4)[None], np.array([-6.0, -0.1, -3.0]), np.array([-0.1, 0.1, -1.0])
     )
-    assert corner.tolist() == [1]
+    assert corner[0].tolist() == [1]
 
 
 class TestFeed:

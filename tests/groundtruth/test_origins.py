@@ -92,9 +92,9 @@ def test_the_votes_of_a_scan_are_those_of_its_parts():
     which = rng.integers(0, 3, 4000)
     order = sorted_by_origin(places[which])
     scan = PreparedScan.of(0, points[order], labels[order], np.eye(4), origins=places[which][order])
-    assert len(scan.rays) == 3 and sum(len(rays.points) for rays in scan.rays) == 4000
+    assert len(scan.rays.ends) == 3 and scan.rays.ends[-1] == 4000
     together = count_votes(
-        [Observation(scan.ends, scan.labels, scan.world_T_places, scan.runs)],
+        [Observation(scan.ends, scan.labels, scan.world_T_places, scan.rays.ends)],
         SPEC,
     )
     expected = count_votes(

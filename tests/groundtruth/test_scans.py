@@ -277,7 +277,7 @@ def test_rays_through_a_box_are_those_a_plain_look_at_all_rays_finds():
         middle, half = rng.uniform(-10, 10, 3), rng.uniform(0.5, 4, 3)
         lower, upper = -half, half
         box_T_sensor = translation(-middle)
-        found = np.sort(scan.rays[0].through(box_T_sensor, lower, upper))
+        found = np.sort(scan.rays.through(box_T_sensor[None], lower, upper)[0])
         steps = np.linspace(0, 1, 1001)[:, None]
         plain = [
             i

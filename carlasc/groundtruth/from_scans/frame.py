@@ -20,7 +20,7 @@ from carlasc.core.arrays import (
     LabelArray,
     Uint8Array,
 )
-from carlasc.core.cells import as_pose, count_points, joined
+from carlasc.core.cells import count_points, joined
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
@@ -35,7 +35,7 @@ from carlasc.groundtruth.from_scans.merging import (
     passed_by,
 )
 from carlasc.groundtruth.inputs import FrameData, GridPlan
-from carlasc.groundtruth.voting.ballot import Ballot, ClassPoints, Observation, SeenClass, Votes
+from carlasc.groundtruth.voting.ballot import Ballot, Observation, SeenClass, Votes
 from carlasc.groundtruth.voting.certainty import (
     UNKNOWN,
     ClassConsensus,
@@ -217,7 +217,8 @@ def find_above(solid: BoolArray, known: BoolArray, bodies: BoolArray, spec: Grid
 
     roofs = np.full((nx + 2, ny + 2), -1)
     roofs[rows + 1, places + 1] = own = np.where(passed > top, top, -1)[group]
-    roof = sliding_window_view(roofs, (3, 3)).max((2, 3)).reshape(-1)
+    wide = np.maximum.reduce([roofs[:-2], roofs[1:-1], roofs[2:]])
+    roof = np.maximum.reduce([wide[:, :-2], wide[:, 1:-1], wide[:, 2:]]).reshape(-1)
     roof[columns] = own
     chosen = np.flatnonzero(roof >= 0)
     over = np.arange(levels) - roof[chosen, None]
@@ -332,7 +333,8 @@ class _FrameSteps:
         if consensus is not None:
             labels = consensus.labels.copy()
         free = votes.free.reshape(-1)
-        bodies = np.flatnonzero(np.isin(self.regions.of_voxel, list(self.regions.actors)))
+        bodies = np.flatnonzero(self.in_body)
+        bodies = bodies[np.isin(self.regions.of_voxel[bodies], list(self.regions.actors))]
         # Before `labels` is overwritten by decisions: doubt is about the class that was seen.
         doubtful = self._doubtful(self._evidence(votes, labels, hits, bodies))
         voted = self._evidence(
@@ -468,11 +470,11 @@ class _FrameSteps:
         """Return the voxels outside of bodies that moving points are in at other times."""
         if self.feed.options.dynamic != "align":
             return _NO_VOXELS
-        voters = [
-            ClassPoints(np.ascontiguousarray(self.merger.moving(frame).T), as_pose(pose))
-            for frame, pose in self.grid_T_sensor.items()
-        ]
-        return np.flatnonzero(self.vote([SeenClass(1, voters)]).hit & ~self.in_body)
+        spec = self.plan.spec
+        found = np.zeros(spec.num_voxels, np.int32)
+        for frame, pose in self.grid_T_sensor.items():
+            count_points(self.merger.moving(frame), [pose], spec, found)
+        return np.flatnonzero((found > 0) & ~self.in_body)
 
     def keep_returns(self, made: _UnfinishedGrid, votes: Votes, consensus: ClassConsensus) -> None:
         """Make voxels with returns of the frame's own scan occupied, unless the returns are
@@ -517,7 +519,8 @@ class _FrameSteps:
         axes = [np.arange(a, b + 1e-9, apart) for a, b in zip(_OWN_LOWER, _OWN_UPPER, strict=True)]
         body = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
         path = count_points(body, self.grid_T_sensor.values(), self.plan.spec)
-        voxels = np.flatnonzero((path > 0) & (made.labels > 0))
+        voxels = np.flatnonzero(path)
+        voxels = voxels[made.labels[voxels] > 0]
         solid = ~self.feed.classes.have_role(made.labels[voxels], "ground")
         is_there_now = self.in_body[voxels] | np.isin(voxels, self.returned[0])
         return voxels[solid & ~is_there_now]

@@ -22,7 +22,6 @@ from carlasc.core.arrays import (
     BoolArray,
     Float32Array,
     FloatArray,
-    Int32Array,
     IntArray,
     LabelArray,
     Uint16Array,
@@ -30,9 +29,15 @@ from carlasc.core.arrays import (
 from carlasc.core.cells import as_pose, pose_of, transform
 from carlasc.core.classes import ClassTable
 from carlasc.core.compiling import cached
-from carlasc.core.geometry import Transform, invert, moved_back, rotate_vectors, transform_points
+from carlasc.core.geometry import (
+    Transform,
+    invert,
+    moved_back,
+    rotate_vectors,
+    transform_points,
+)
 from carlasc.core.grids import GridSpec
-from carlasc.core.scans import RaysFromPlace, lengths, runs_of_origins
+from carlasc.core.scans import Rays, lengths
 from carlasc.groundtruth.options import Dynamic
 from carlasc.groundtruth.voting.ballot import ClassPoints, Observation, SeenClass
 from carlasc.motion import BODY_MARGIN_M
@@ -137,8 +142,7 @@ class PreparedScan:
         sure: (N,) float32, probability of each label from a network; None: 1.
         ends: (N, 3) float32, the points relative to the origins of their rays, metres: `points`
             themselves if that is the sensor.
-        rays: the rays to the points, by origin and time: several for several sensors or a sensor
-            that moves or turns during the scan.
+        rays: the rays to the points, by origin and time.
     """
 
     frame: int
@@ -149,7 +153,7 @@ class PreparedScan:
     seconds: float
     moving: IntArray
     ends: Float32Array
-    rays: tuple[RaysFromPlace, ...]
+    rays: Rays
     sure: Float32Array | None = None
 
     @classmethod
@@ -188,10 +192,6 @@ class PreparedScan:
         # Rays are kept relative to their origins; the origin is in the pose of the place, so that
         # the rule of votes is the same for a sensor that moves during the scan.
         ends = points if origins is None or not origins[:, :3].any() else points - origins[:, :3]
-        rays = tuple(
-            RaysFromPlace.of(ends, part, origin)
-            for part, origin in runs_of_origins(origins, len(points))
-        )
         return cls(
             frame,
             points,
@@ -201,14 +201,14 @@ class PreparedScan:
             seconds,
             moving,
             ends,
-            rays,
+            Rays.of(ends, origins),
             sure,
         )
 
     @cached_property
     def world_T_places(self) -> FloatArray:
         """(K, 4, 4) poses of the origins of rays."""
-        return self.world_T_sensor @ np.stack([rays.sensor_T_place for rays in self.rays])
+        return self.world_T_sensor @ self.rays.sensor_T_places
 
     def cast(self, map_T_world: Transform, lower: FloatArray, upper: FloatArray) -> Cast:
         """Return the rays for a map of free space: those that pass through a region.
@@ -222,54 +222,47 @@ class PreparedScan:
         origins, reach_m = places[:, :3, 3], self.reach_m  # where no point is, no ray is
         lower = np.maximum(lower, origins.min(axis=0) - reach_m)
         upper = np.minimum(upper, origins.max(axis=0) + reach_m)
-        return Cast(self.ends, self.runs, places, lower, upper)
-
-    @property
-    def runs(self) -> IntArray:
-        """(K,) index after the last ray of each origin."""
-        return np.array([rays.part.stop for rays in self.rays])
+        return Cast(self.ends, self.rays.ends, places, lower, upper)
 
     def through(
         self, track: Track, lower: FloatArray, upper: FloatArray
-    ) -> Iterator[tuple[RaysFromPlace, Transform, Int32Array]]:
-        """Yield the rays of each origin and time, (4, 4) actor_T_place, and the indices of its rays
-        that intersect a box; nothing if the track does not extend to the scan.
+    ) -> tuple[IntArray, FloatArray, Cast] | None:
+        """Return the (M,) rays that intersect a box, where they end, (M, 3) metres, frame of the
+        actor, and their cast; None if the track does not extend to the scan.
 
         Args:
             track: the actor, which is where it was at the time of the rays.
             lower: (3,) lower corner of the box, metres, frame of the actor.
             upper: (3,) upper corner.
         """
-        for rays in self.rays:
-            if (pose := track.pose(self.frame, rays.seconds)) is not None:
-                actor_T_place = invert(pose) @ self.world_T_sensor @ rays.sensor_T_place
-                yield rays, actor_T_place, rays.through(actor_T_place, lower, upper)
+        pose, velocity = track.pose(self.frame), track.velocity_at(self.frame)
+        if pose is None or velocity is None:
+            return None
+        poses = np.repeat(pose[None], len(self.rays.ends), axis=0)
+        poses[:, :3, 3] += velocity * self.rays.seconds[:, None]
+        actor_T_places = invert(poses) @ self.world_T_sensor @ self.rays.sensor_T_places
+        rays, ends, body = self.rays.through(actor_T_places, lower, upper)
+        return rays, body, Cast(self.rays.points[rays], ends, actor_T_places, lower, upper)
 
     def at_frame(self, tracks: Iterable[Track]) -> PreparedScan:
         """Return the scan with the points of tracks where they are at the time of the frame."""
-        if not any(rays.seconds for rays in self.rays):
+        seconds = self.rays.seconds
+        if not seconds.any():
             return self
-        times = np.concatenate([np.full(len(rays.points), rays.seconds) for rays in self.rays])
-        points = self.points.copy()
+        times = np.repeat(seconds, np.diff(self.rays.ends, prepend=0))
+        points, ends = self.points.copy(), self.ends.copy()
         for track in tracks:
             own, velocity = track.members.get(self.frame), track.velocity_at(self.frame)
             if own is not None and velocity is not None:
                 moves = rotate_vectors(invert(self.world_T_sensor), velocity)
                 points[own] = moved_back(points[own], times[own], moves)
-        return replace(self, points=points, ends=self.ends + (points - self.points))
+                ends[own] = self.ends[own] + (points[own] - self.points[own])
+        return replace(self, points=points, ends=ends)
 
 
-@dataclass(frozen=True)
-class _Carried:
-    """What a scan saw of the body of an actor, in the frame of the actor.
-
-    Attributes:
-        cast: the rays through the body.
-        points: (3, M) float32, metres, the points of the actor.
-    """
-
-    cast: Cast
-    points: Float32Array
+# what a scan saw of the body of an actor: the rays through it, and (3, M) points of the actor,
+# metres, both in the frame of the actor
+_Carried = tuple[Cast, Float32Array]
 
 
 class SeenBody(NamedTuple):
@@ -324,7 +317,7 @@ class Merger:
         """Return the observation by the frame's own scan, whose rays count everywhere."""
         scan = self.settled(now.frame)
         places = now.grid_T_world @ scan.world_T_places
-        return Observation(scan.ends, self.labels(now.frame), places, scan.runs)
+        return Observation(scan.ends, self.labels(now.frame), places, scan.rays.ends)
 
     def points(self, now: Instant, window: Iterable[int]) -> list[SeenClass]:
         """Return the static points of each scan, and all points of the frame's own scan, by class.
@@ -385,8 +378,8 @@ class Merger:
                 if mirror or other != now.frame:
                     carried = self._carry(number, other, now)
                     if carried is not None:
-                        casts[other] = carried.cast
-                        points.append(ClassPoints(carried.points, grid_T_actor))
+                        casts[other], seen = carried
+                        points.append(ClassPoints(seen, grid_T_actor))
             if casts:
                 votes = SeenClass(track.label, points, regions.of_voxel, region)
                 yield SeenBody(number, pose, casts, votes)
@@ -439,14 +432,13 @@ class Merger:
                     continue
                 lower, upper = track.lower - _AROUND_M, track.upper + _AROUND_M
                 least, most = track.lower - _UNDER_M, track.upper + _UNDER_M
-                for rays, actor_T_place, crossing in scan.through(
-                    track, np.minimum(lower, least), np.maximum(upper, most)
-                ):
-                    body = transform_points(actor_T_place, rays.points[crossing])
-                    near = rays.part.start + crossing
-                    inside = ((body >= lower) & (body <= upper)).all(axis=1) & ~ground[near]
-                    below = ((body >= least) & (body <= most)).all(axis=1) & ground[near]
-                    static[near[inside]], under[near[below]] = False, True
+                found = scan.through(track, np.minimum(lower, least), np.maximum(upper, most))
+                if found is None:
+                    continue
+                near, body, _ = found
+                inside = ((body >= lower) & (body <= upper)).all(axis=1) & ~ground[near]
+                below = ((body >= least) & (body <= most)).all(axis=1) & ground[near]
+                static[near[inside]], under[near[below]] = False, True
             self._static[frame] = static, under
         return self._static[frame][0]
 
@@ -478,21 +470,11 @@ class Merger:
             return None
         kept = self._carried[other]
         if number not in kept:
-            scan = self.scan_of(other)
-            own = np.zeros(len(scan.points), np.bool_)
-            own[track.members.get(other, [])] = True
-            rays, hits, places = [], [], []
-            for part, actor_T_place, crossing in scan.through(track, track.lower, track.upper):
-                if len(crossing):
-                    rays.append(part.points[crossing])
-                    seen = rays[-1][own[part.part][crossing]]
-                    hits.append(transform_points(actor_T_place, seen).astype(np.float32))
-                    places.append(actor_T_place)
-            if rays:
-                ends = np.cumsum([len(points) for points in rays])
-                cast = Cast(np.concatenate(rays), ends, np.stack(places), track.lower, track.upper)
-                points = np.ascontiguousarray(np.concatenate(hits).T)
-                kept[number] = _Carried(cast, points)
+            found = self.scan_of(other).through(track, track.lower, track.upper)
+            if found is not None and len(found[0]):
+                rays, places, cast = found
+                seen = np.isin(rays, track.members.get(other, []))
+                kept[number] = cast, np.ascontiguousarray(places[seen].astype(np.float32).T)
         return kept.setdefault(number, None)
 
 

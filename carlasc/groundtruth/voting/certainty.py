@@ -427,10 +427,12 @@ def _find_shares(
     # Many votes for two classes are of two objects in the voxel, so their confusion is made
     # symmetric.
     many = (few + few.T) / 2
-    doubtful, unsure = np.empty(len(shares), np.int64), 0
+    doubtful, unsure, scores = np.empty(len(shares), np.int64), 0, np.empty(kinds)
+    usual = np.log(frequency + _LEAST_PRIOR)
     for i in range(len(cast.voxels)):
         if place[i] >= 0:
-            _posterior(cast, i, few, many, frequency, shares[place[i]])
+            scores[:] = usual
+            _posterior(cast, i, few, many, scores, shares[place[i]])
             if shares[place[i]].max() < _SURE:
                 doubtful[unsure] = i
                 unsure += 1
@@ -440,7 +442,9 @@ def _find_shares(
         for k in range(unsure):
             i = doubtful[k]
             _neighbour_prior(cast, i, frequency, place, shares, prior)
-            _posterior(cast, i, few, many, prior, changed[k])
+            for kind in range(kinds):
+                scores[kind] = np.log(prior[kind] + _LEAST_PRIOR)
+            _posterior(cast, i, few, many, scores, changed[k])
         for k in range(unsure):
             shares[place[doubtful[k]]] = changed[k]
     likeliest, left = np.empty(kinds), np.empty(kinds)
@@ -455,23 +459,24 @@ def _posterior(
     i: int,
     few: FloatArray,
     many: FloatArray,
-    prior: FloatArray,
+    scores: FloatArray,
     out: Float32Array,
 ) -> None:
-    """Write the probability of each class of a voxel from its votes and a prior."""
+    """Write the probability of each class of a voxel from its votes and `scores`, the logarithms of
+    a prior, which are overwritten.
+    """
     begins, own, weight, total = cast.begins, cast.own, cast.weight, cast.total[i]
-    scores = np.log(prior + _LEAST_PRIOR)
     likely = few if total < _FEW else many
     for row in range(begins[i], begins[i + 1]):
         votes = min(1.0, _ENOUGH_VOTES / total) * weight[row]
-        for c in range(len(prior)):
+        for c in range(len(scores)):
             scores[c] += votes * likely[c, own[row]]
     # The best score becomes 0 before the exponential, which cannot overflow then.
     best, whole = scores.max(), 0.0
-    for c in range(len(prior)):
+    for c in range(len(scores)):
         scores[c] = np.exp(scores[c] - best)
         whole += scores[c]
-    for c in range(len(prior)):
+    for c in range(len(scores)):
         out[c] = scores[c] / whole
 
 
