@@ -118,6 +118,8 @@ class FreeSpaceEvidence:
         points: (M, 3) float64 of the same points, metres, world.
         labels: most frequent class of each cluster; 0 without labels.
         freed: number of points of each cluster at places that were free at other times.
+        passed: number of them at places that were free most of the time, not on one side in time
+            only, as behind edges.
         around: number of static points around each cluster, at its height. It is large for pieces
             of static objects.
         world_T_sensor: (4, 4) pose of the scan.
@@ -133,6 +135,7 @@ class FreeSpaceEvidence:
     points: tuple[FloatArray, ...]
     labels: tuple[int, ...]
     freed: tuple[int, ...]
+    passed: tuple[int, ...]
     around: tuple[int, ...]
     world_T_sensor: Transform
     near: IntArray
@@ -236,7 +239,9 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
         labels = scan.labels[candidates].astype(np.int64)
         kind = np.where(np.isin(labels, sorted(movable)), labels, 0)
     groups = _clusters(world, kind, moved, left, static)
-    freed = tuple(int((moved | left)[group].sum()) for group in groups)
+    freed, passed = (
+        tuple(int(flags[group].sum()) for group in groups) for flags in (moved | left, moved)
+    )
     clusters = [candidates[group] for group in groups]
     points = [world[group] for group in groups]
     classes = [
@@ -244,7 +249,7 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
         for own in clusters
     ]
     around = _count_around(world, groups, static)
-    parts = (tuple(clusters), tuple(points), tuple(classes), freed, around)
+    parts = (tuple(clusters), tuple(points), tuple(classes), freed, passed, around)
     near = cells_around(scan.points[candidates])
     times = () if scan.times is None else tuple(scan.times[members] for members in clusters)
     below = scan.points[ground & (np.abs(scan.points[:, :2]) < _AROUND_M).all(axis=1), 2]

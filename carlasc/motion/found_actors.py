@@ -67,6 +67,9 @@ _BESIDE_M = 1.8  # farther beside the way of the sensor, another vehicle may dri
 # changes.
 _FOOT_M, _STANDS_M, _STRETCH_M = 0.6, 1.0, 2.6
 _HIGH_M, _SHIFTS_M, _DELAY_S = 0.5, 0.04, 0.1
+# A cluster that is no actor moved if this share of its points is at places that were free most of the
+# time: thin things are invisible from one side.
+_PASSED = 0.2
 _OWN_SHARE = 0.5  # an actor with so many points in these cells is none
 # A cluster is split between chains of so many observations, whose middles are expected so near to
 # it, and whose velocities differ by so much. So many points of their last ones stand for them.
@@ -96,7 +99,8 @@ class ActorFollower:
     """Follows what moved from scan to scan.
 
     Attributes:
-        moved: (M,) indices of the points that moved, tracked or not, by frame.
+        moved: (M,) indices of the points that moved, by frame: those of clusters that rays passed
+            through, tracked or not.
         own: (6,) lower and upper corners of the parts of the recording vehicle, metres, sensor
             frame; known after `finish`.
         riders: the numbers of the actors that are such parts; known after `finish`.
@@ -137,7 +141,12 @@ class ActorFollower:
         """Add the evidence of the next scan, and return the actors with enough evidence that ended
         before it.
         """
-        moved = np.sort(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
+        passed = (
+            members
+            for members, count in zip(scan.clusters, scan.passed, strict=True)
+            if count >= _PASSED * len(members)
+        )
+        moved = np.sort(np.concatenate([np.empty(0, np.int64), *passed]))
         self.moved[scan.frame] = moved.astype(np.int32)
         self.seen += scan.count
         self._poses.append(scan.world_T_sensor)
