@@ -67,8 +67,8 @@ _BESIDE_M = 1.8  # farther beside the way of the sensor, another vehicle may dri
 # changes.
 _FOOT_M, _STANDS_M, _STRETCH_M = 0.6, 1.0, 2.6
 _HIGH_M, _SHIFTS_M, _DELAY_S = 0.5, 0.04, 0.1
-# A cluster that is no actor moved if this share of its points is at places that were free most of the
-# time: thin things are invisible from one side.
+# A cluster that is no actor moved if this share of its points is at places that were free most of
+# the time: thin things are invisible from one side.
 _PASSED = 0.2
 _OWN_SHARE = 0.5  # an actor with so many points in these cells is none
 # A cluster is split between chains of so many observations, whose middles are expected so near to
