@@ -67,8 +67,8 @@ _BESIDE_M = 1.8  # farther beside the way of the sensor, another vehicle may dri
 # changes.
 _FOOT_M, _STANDS_M, _STRETCH_M = 0.6, 1.0, 2.6
 _HIGH_M, _SHIFTS_M, _DELAY_S = 0.5, 0.04, 0.1
-# A cluster that is no actor moved if this share of its points is at places that were free most of
-# the time: thin things are invisible from one side.
+# A cluster that is no actor moved if this share of its points at free places were free most of the
+# time: thin things are invisible from one side.
 _PASSED = 0.2
 _OWN_SHARE = 0.5  # an actor with so many points in these cells is none
 # A cluster is split between chains of so many observations, whose middles are expected so near to
@@ -143,8 +143,8 @@ class ActorFollower:
         """
         passed = (
             members
-            for members, count in zip(scan.clusters, scan.passed, strict=True)
-            if count >= _PASSED * len(members)
+            for members, count, freed in zip(scan.clusters, scan.passed, scan.freed, strict=True)
+            if count >= _PASSED * freed
         )
         moved = np.sort(np.concatenate([np.empty(0, np.int64), *passed]))
         self.moved[scan.frame] = moved.astype(np.int32)
