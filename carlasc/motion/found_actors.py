@@ -38,6 +38,7 @@ _REACH_M, _MAX_SPEED_M_S = (
     1.0,
     25.0,
 )
+_GROWS_M = 1.0  # a person does not become higher by so much: something else is there
 _FAR_M = 15.0  # fast first test: no actor moves farther between two observations
 _HISTORY = 6  # observations that the prediction is made from
 _MIN_OBSERVATIONS, _MIN_PATH_M, _MIN_SPEED_M_S = 5, 1.0, 0.5  # an actor needs so much for a track
@@ -625,6 +626,8 @@ def _costs(links: list[_Link], alive: list[_ActorChain]) -> list[tuple[float, in
     can &= np.abs(middle - at).max(axis=-1) < _FAR_M
     can &= (np.linalg.norm(gap[..., :2], axis=-1) <= reach) & (gap[..., 2] <= _REACH_M)
     can &= aside <= 3 * reach + 2.0
+    small = np.array([end.is_small for end in ends])
+    can &= ~(small & ((high - low - size)[..., 2] > _GROWS_M))
     sizes = np.abs((high - low) - size).sum(axis=-1)
     cost = np.linalg.norm(gap, axis=-1) + 0.3 * aside + 0.2 * sizes
     return [(float(cost[i, j]), i, j) for i, j in np.argwhere(can).tolist()]
