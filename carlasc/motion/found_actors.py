@@ -627,7 +627,8 @@ def _costs(links: list[_Link], alive: list[_ActorChain]) -> list[tuple[float, in
     can &= (np.linalg.norm(gap[..., :2], axis=-1) <= reach) & (gap[..., 2] <= _REACH_M)
     can &= aside <= 3 * reach + 2.0
     small = np.array([end.is_small for end in ends])
-    can &= ~(small & ((high - low - size)[..., 2] > _GROWS_M))
+    height = (high - low)[..., 2]
+    can &= ~(small & (height > _WHOLE_M[1]) & (height - size[:, 2] > _GROWS_M))
     sizes = np.abs((high - low) - size).sum(axis=-1)
     cost = np.linalg.norm(gap, axis=-1) + 0.3 * aside + 0.2 * sizes
     return [(float(cost[i, j]), i, j) for i, j in np.argwhere(can).tolist()]
