@@ -144,7 +144,12 @@ class ActorFollower:
         """
         passed = (
             members
-            for members, count, freed in zip(scan.clusters, scan.passed, scan.freed, strict=True)
+            for members, count, freed in zip(
+                scan.clusters,
+                scan.passed,
+                scan.freed,
+                strict=True,
+            )
             if count >= _PASSED * freed
         )
         moved = np.sort(np.concatenate([np.empty(0, np.int64), *passed]))
