@@ -51,6 +51,7 @@ _IN_A_ROW = 4  # the same, if all scans on one side in time, from the farthest i
 # Every third scan is looked up first. A place that so many scans saw occupied, and none saw free,
 # is static.
 _EVERY, _SURE = 3, 4
+_LATE = 8  # a place that scans from this offset on saw occupied, and none saw free, stays
 _CELL_M = 0.35  # points of one object are in neighbouring cells of this size, seen from above
 _MIN_POINTS = 3  # smaller clusters are noise
 _JUDGED_CELL_M = 0.15  # one point per cell of this size is looked up, and decides for the others
@@ -116,6 +117,8 @@ class FreeSpaceEvidence:
         points: (M, 3) float64 of the same points, metres, world.
         labels: most frequent class of each cluster; 0 without labels.
         freed: number of points of each cluster at places that were free at other times.
+        passed: number of them at places that were free most of the time, not on one side in time
+            only, as behind edges.
         around: number of static points around each cluster, at its height. It is large for pieces
             of static objects.
         world_T_sensor: (4, 4) pose of the scan.
@@ -131,6 +134,7 @@ class FreeSpaceEvidence:
     points: tuple[FloatArray, ...]
     labels: tuple[int, ...]
     freed: tuple[int, ...]
+    passed: tuple[int, ...]
     around: tuple[int, ...]
     world_T_sensor: Transform
     near: IntArray
@@ -251,13 +255,15 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     verdict = _judge(
         scan, candidates[asked_first], [window[i] for i in before], [window[i] for i in after]
     )
-    moved, left, static = (answers[same] for answers in verdict)
+    moved, left, static, stays = (answers[same] for answers in verdict)
     kind = np.zeros(len(candidates), np.int64)
     if scan.labels is not None and movable:
         labels = scan.labels[candidates].astype(np.int64)
         kind = np.where(np.isin(labels, sorted(movable)), labels, 0)
-    groups = _clusters(world, kind, moved, left, static)
-    freed = tuple(int((moved | left)[group].sum()) for group in groups)
+    groups = _clusters(world, kind, moved, left, static, stays)
+    freed, passed = (
+        tuple(int(flags[group].sum()) for group in groups) for flags in (moved | left, moved)
+    )
     clusters = [candidates[group] for group in groups]
     points = [world[group] for group in groups]
     classes = [
@@ -265,7 +271,7 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
         for own in clusters
     ]
     around = _count_around(world, groups, static)
-    parts = (tuple(clusters), tuple(points), tuple(classes), freed, around)
+    parts = (tuple(clusters), tuple(points), tuple(classes), freed, passed, around)
     near = cells_around(scan.points[candidates])
     times = () if scan.times is None else tuple(scan.times[members] for members in clusters)
     below = scan.points[ground & (np.abs(scan.points[:, :2]) < _AROUND_M).all(axis=1), 2]
@@ -320,9 +326,9 @@ def _others(window: deque[_Kept], current: int) -> tuple[list[int], list[int]]:
 
 def _judge(
     scan: EvidenceScan, candidates: IntArray, before: list[_Kept], after: list[_Kept]
-) -> tuple[BoolArray, BoolArray, BoolArray]:
+) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
     """Return which candidates are at places that were free most of the time, free on one side in
-    time, and occupied (static).
+    time, occupied (static), and occupied for seconds without ever being free.
     """
     points = np.ascontiguousarray(scan.points[candidates], np.float32)
     free, hit = np.zeros((2, 2, len(points)), np.uint32)
@@ -353,7 +359,8 @@ def _judge(
     in_a_row = np.bitwise_count(free & ~smeared).max(axis=0)
     moved = (seen_through >= _AGREEING) & (seen_through > occupied)
     left = ~moved & (in_a_row >= _IN_A_ROW)
-    return moved, left, ~(moved | left) & (occupied > seen_through)
+    stays = (hit >> np.uint32(_LATE) > 0).any(axis=0) & (seen_through == 0)
+    return moved, left, ~(moved | left) & (occupied > seen_through), stays
 
 
 def _clusters(
@@ -362,6 +369,7 @@ def _clusters(
     moved: BoolArray,
     left: BoolArray,
     static: BoolArray,
+    stays: BoolArray,
 ) -> list[IntArray]:
     """Group moved points by cells, seen from above, and add the points around them that are not
     static.
@@ -373,6 +381,8 @@ def _clusters(
         left: (N,) points at places that were free before or after only. A cell needs a large share
             of them, because a thin surface may be invisible from one side.
         static: (N,) points at places that were occupied at other times.
+        stays: (N,) those among them at places that were occupied seconds before or after, and never
+            free.
 
     Returns:
         Indices of the points of each cluster.
@@ -406,9 +416,10 @@ def _clusters(
         if count < _MIN_POINTS:
             continue
         # Of an object that moved as a whole, static points belong to it too: its sides often pass
-        # the places of its own earlier surface. Otherwise static points are of something behind it.
+        # the places of its own earlier surface. What stays does not, and otherwise static points
+        # are of something behind it.
         whole = count >= _FLAGGED_SHARE * np.count_nonzero(core)
-        members = members[~static[members] | (core & whole)]
+        members = members[~static[members] | (core & whole & ~stays[members])]
         groups.append(np.sort(members))
     return groups
 

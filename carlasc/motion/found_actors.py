@@ -38,6 +38,7 @@ _REACH_M, _MAX_SPEED_M_S = (
     1.0,
     25.0,
 )
+_GROWS_M = 1.0  # a person does not become higher by so much: something else is there
 _FAR_M = 15.0  # fast first test: no actor moves farther between two observations
 _HISTORY = 6  # observations that the prediction is made from
 _MIN_OBSERVATIONS, _MIN_PATH_M, _MIN_SPEED_M_S = 5, 1.0, 0.5  # an actor needs so much for a track
@@ -70,6 +71,9 @@ _BESIDE_M = 1.8  # farther beside the way of the sensor, another vehicle may dri
 # changes.
 _FOOT_M, _STANDS_M, _STRETCH_M = 0.6, 1.0, 2.6
 _HIGH_M, _SHIFTS_M, _DELAY_S = 0.5, 0.04, 0.1
+# A cluster that is no actor moved if this share of its points at free places were free most of the
+# time: thin things are invisible from one side.
+_PASSED = 0.2
 _OWN_SHARE = 0.5  # an actor with so many points in these cells is none
 # A cluster is split between chains of so many observations, whose middles are expected so near to
 # it, and whose velocities differ by so much. So many points of their last ones stand for them.
@@ -99,7 +103,8 @@ class ActorFollower:
     """Follows what moved from scan to scan.
 
     Attributes:
-        moved: (M,) indices of the points that moved, tracked or not, by frame.
+        moved: (M,) indices of the points that moved, by frame: those of clusters that rays passed
+            through, tracked or not.
         own: (6,) lower and upper corners of the parts of the recording vehicle, metres, sensor
             frame; known after `finish`.
         riders: the numbers of the actors that are such parts; known after `finish`.
@@ -140,7 +145,17 @@ class ActorFollower:
         """Add the evidence of the next scan, and return the actors with enough evidence that ended
         before it.
         """
-        moved = np.sort(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
+        passed = (
+            members
+            for members, count, freed in zip(
+                scan.clusters,
+                scan.passed,
+                scan.freed,
+                strict=True,
+            )
+            if count >= _PASSED * freed
+        )
+        moved = np.sort(np.concatenate([np.empty(0, np.int64), *passed]))
         self.moved[scan.frame] = moved.astype(np.int32)
         self.seen += scan.count
         self._poses.append(scan.world_T_sensor)
@@ -635,6 +650,9 @@ def _costs(links: list[_Link], alive: list[_ActorChain]) -> list[tuple[float, in
     can &= np.abs(middle - at).max(axis=-1) < _FAR_M
     can &= (np.linalg.norm(gap[..., :2], axis=-1) <= reach) & (gap[..., 2] <= _REACH_M)
     can &= aside <= 3 * reach + 2.0
+    small = np.array([end.is_small for end in ends])
+    height = (high - low)[..., 2]
+    can &= ~(small & (height > _WHOLE_M[1]) & (height - size[:, 2] > _GROWS_M))
     sizes = np.abs((high - low) - size).sum(axis=-1)
     cost = np.linalg.norm(gap, axis=-1) + 0.3 * aside + 0.2 * sizes
     return [(float(cost[i, j]), i, j) for i, j in np.argwhere(can).tolist()]

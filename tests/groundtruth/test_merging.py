@@ -188,6 +188,21 @@ def test_points_on_the_recording_vehicle_are_left_out_of_every_frame():
     assert classes(merging, 3) == [1] and classes(merging, 15) == sorted([1, VEHICLE])
 
 
+def test_ground_in_a_body_that_is_higher_than_the_ground_around_it_is_not_static():
+    road = [(x, y, -1.0) for x in (-1.4, 0.0, 1.4) for y in (-0.9, 0.9, 1.0)]
+    local = np.array([*road, (0.0, 0.0, -1.0), (0.5, 0.2, -0.7)])
+    points = transform_points(invert(sensor_pose(15)) @ actor_pose(15), local).astype(np.float32)
+    labels = np.full(len(points), ROAD, np.uint16)
+
+    def static(seen):
+        one = PreparedScan.of(15, points[seen:], labels[seen:], sensor_pose(15), seconds=1.5)
+        actors = MovingActors.of([replace(track(), members={})])
+        return Merger({15: one}.__getitem__, actors, CARLA, "align").static(15)
+
+    assert static(0).tolist() == [*[True] * 10, False]  # a foot
+    assert static(6).all()  # too little ground is known
+
+
 def test_a_track_that_never_moves_is_part_of_the_static_scene():
     still = track()
     still.velocity[:] = 0

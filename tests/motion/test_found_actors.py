@@ -10,6 +10,8 @@ from helpers.references.whole_drives import find_actors, link_segments
 from helpers.scenes.moving_scenes import CAR, PERSON, WALL, WALLS, box, car, film, person
 
 from carlasc.captures.settings import Lidar
+from carlasc.motion.evidence import FreeSpaceEvidence
+from carlasc.motion.found_actors import ActorFollower
 from carlasc.motion.tracks import MovingActors
 
 
@@ -75,6 +77,15 @@ def test_moved_points_are_told_for_every_frame():
     assert sorted(found.moved) == list(range(20))
     for segment in found.segments:
         assert np.isin(segment.members, found.moved[segment.frame]).all()
+
+
+def test_what_is_free_on_one_side_in_time_only_does_not_move_by_itself():
+    follower, near = ActorFollower(), np.empty(0, np.int64)
+    clusters = np.arange(10), np.arange(10, 20)
+    points = (np.zeros((10, 3)), np.full((10, 3), 30.0))
+    parts = (clusters, points, (0, 0), (10, 10), (1, 9), (0, 0))
+    follower.add(FreeSpaceEvidence(0, 0.0, 20, *parts, np.eye(4), near))
+    assert follower.moved[0].tolist() == list(range(10, 20))
 
 
 def test_nothing_moves_without_scans_or_with_one():

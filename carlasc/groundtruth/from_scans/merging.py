@@ -52,6 +52,9 @@ RECENT_S = 0.25  # scans within this time before and after a frame show the scen
 # across and up.
 _AROUND_M = np.array([0.3, 0.3, 0.1])
 _UNDER_M = np.array([0.1, 0.1, 0.3])  # ground so near to it, and below, may be of wheels or feet
+# Ground in a body is of wheels or feet if it is so much higher than so many points of ground around
+# it, so near.
+_FOOT_M, _BESIDE_M, _BESIDE = 0.15, 0.6, 8
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 _ByClass = dict[int, tuple[Float32Array, Float32Array | None]]  # points and their probabilities
 
@@ -432,13 +435,17 @@ class Merger:
                     continue
                 lower, upper = track.lower - _AROUND_M, track.upper + _AROUND_M
                 least, most = track.lower - _UNDER_M, track.upper + _UNDER_M
-                found = scan.through(track, np.minimum(lower, least), np.maximum(upper, most))
+                found = scan.through(track, track.lower - _BESIDE_M, track.upper + _BESIDE_M)
                 if found is None:
                     continue
                 near, body, _ = found
                 inside = ((body >= lower) & (body <= upper)).all(axis=1) & ~ground[near]
                 below = ((body >= least) & (body <= most)).all(axis=1) & ground[near]
                 static[near[inside]], under[near[below]] = False, True
+                beside = body[ground[near] & ~below, 2]
+                if len(beside) >= _BESIDE:
+                    foot = body[:, 2] > np.median(beside) + _FOOT_M
+                    static[near[below & foot]] = False
             self._static[frame] = static, under
         return self._static[frame][0]
 
