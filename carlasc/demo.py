@@ -93,7 +93,9 @@ def demonstrate(
     from carlasc.viewing import Scene, render, view
 
     _check_packages()
-    start, out, step = time.perf_counter(), Path(out), step or _without_progress
+    start = time.perf_counter()
+    out = Path(out)
+    step = step or _without_progress
     train, val = out / TRAIN, out / VAL
     if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not train.is_dir())):
         raise ConflictError(

@@ -16,8 +16,8 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "carlasc"
 FILES = sorted([*PACKAGE.rglob("*.py"), *(ROOT / "converters").rglob("*.py")])
 MOST_PARAMETERS, MOST_FIELDS, MOST_ENTRIES = 12, 12, 16
-MOST_TOKENS = {"carlasc": 452_500, "converters": 108_900}
-DENSEST = 9.5  # tokens a line of code
+MOST_TOKENS = {"carlasc": 453_500, "converters": 108_900}
+DENSEST = 9.45  # tokens a line of code
 WIDEST = 100  # columns
 LONG = 500  # lines of a module, above which it is named
 # names of classes that hold options

@@ -84,7 +84,8 @@ class Simulator(Capture, ABC):
         check_at_least(1, count=count, sensors=sensors)
         check_at_least(0, first_frame=first_frame, seed=seed)
         check_choice("traffic", traffic, TrafficLevel)
-        self.location, self.classes = f"the simulated drive of seed {seed}", CARLA
+        self.location = f"the simulated drive of seed {seed}"
+        self.classes = CARLA
         self._frames, self._sensors = range(first_frame, first_frame + count), sensors
         self.seed, self.traffic, self.lidar, self.bev = seed, traffic, lidar or Lidar(), bev
         self.cameras = {camera.name: camera for camera in self.make_cameras(cameras)}

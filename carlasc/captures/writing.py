@@ -144,7 +144,8 @@ class CaptureWriter:
             FormatError: the scan has no labels or instances, or the pose is not rigid.
             StorageError: the disk is full, or the folder cannot be written to.
         """
-        scan, where = recording.scan, f"{self.location}: sensor {sensor}, frame {frame}"
+        scan = recording.scan
+        where = f"{self.location}: sensor {sensor}, frame {frame}"
         if scan.labels is None or scan.instances is None:
             raise FormatError(
                 where,

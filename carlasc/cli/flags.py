@@ -194,7 +194,8 @@ class WorkFlags(Flags):
         from carlasc.running.spreading import Part, Run
 
         own = vars(self)  # of `PartFlags` and `RunFlags`
-        part, listed = Part.parse(own.get("part") or "1/1"), own.get("sequences_from")
+        part = Part.parse(own.get("part") or "1/1")
+        listed = own.get("sequences_from")
         bar = progress_bar(title, unit) if shown else nullcontext()
         with bar as progress, self._engine() as executor:
             yield Run(self.workers or usual, executor, part, listed, progress)

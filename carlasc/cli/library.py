@@ -204,7 +204,8 @@ def make_option(
     if isinstance(default, tuple):
         default = ":".join(map(str, default))
     if kind.type is bool and default is not False:
-        typed, default = f"{typed}/--no-{typed[2:]}", {True: "yes"}.get(default)
+        typed = f"{typed}/--no-{typed[2:]}"
+        default = {True: "yes"}.get(default)
     info = typer.Option(
         typed,
         help=text

@@ -65,7 +65,8 @@ def regrid(
     Existing frames are skipped, so the same command continues an interrupted run. In the folder of
     a sequence, `carlasc regrid --res 0.2` is enough.
     """
-    voting, chosen = making.votes.make(), _observe(observe, making, poses, from_grid)
+    voting = making.votes.make()
+    chosen = _observe(observe, making, poses, from_grid)
     spec = making.grid.spec()
     with run.spread("regrid") as spread:
         result = written.make(source, spec, out, observe=chosen, voting=voting, run=spread)

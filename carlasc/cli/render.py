@@ -68,7 +68,9 @@ def render(
         result = carlasc.viewing.overlay(scenes[0], over, out or Path(f"{over}.png"), **film)
         content = f"grid over {over}"
     else:
-        drawn, taken, looks = scenes if grid_of else scenes[0], camera.make(), style.make()
+        drawn = scenes if grid_of else scenes[0]
+        taken = camera.make()
+        looks = style.make()
         with work.spread("Rendering", "pictures") as run:
             result = options.make(drawn, out, camera=taken, style=looks, run=run)
         content = ", ".join(result.what)

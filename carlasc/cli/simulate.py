@@ -77,7 +77,8 @@ def simulate(
 def _print_capture(result: carlasc.captures.SimulationResult) -> None:
     from carlasc.cli.tables import print_table
 
-    frames, sensors = count_of(result.count, "frame"), count_of(result.sensors, "sensor")
+    frames = count_of(result.count, "frame")
+    sensors = count_of(result.sensors, "sensor")
     total = sum(result.classes.values())
     print_table(
         ("class", "points", "share"),

@@ -34,9 +34,13 @@ class ChosenFrames(Recording):
     ) -> None:
         self._own, self.frames = own, frames
         self._turn = None if vehicle_is_level else level_T_scan
-        self.name, self.split, self.location = own.name, own.split, own.location
+        self.name = own.name
+        self.split = own.split
+        self.location = own.location
         self.has_labels, self.has_instances = own.has_labels, own.has_instances
-        self.voxels, self.rays, self.sensors = own.voxels, own.rays, own.sensors
+        self.voxels = own.voxels
+        self.rays = own.rays
+        self.sensors = own.sensors
         if level_T_scan is None:
             return
         if any(sensor.points_in != "sensor" for sensor in own.sensors):

@@ -113,8 +113,12 @@ class Clips:
         return combined(sorted(states.items())) if states else ""
 
     def _convert(self, name: str, state: str, place: Path, sink: FolderSink, run: Run) -> Any:
-        given, record, done = {**self.arguments}, layout.record_file("clip"), self._done(name)
-        name, writers, changed = without_credentials(name), list[FolderWriter](), False
+        given = {**self.arguments}
+        record = layout.record_file("clip")
+        done = self._done(name)
+        name = without_credentials(name)
+        writers = list[FolderWriter]()
+        changed = False
         mine = f"{name}\n{state}".encode()
         for one in find_recordings(open_converter(given["name"], place, given["options"])):
             writers.append(writer := sink.sequence(sequence_path(one)))
@@ -255,7 +259,8 @@ def convert_clips(
         most,
     )
     steps = StepCounter(run.progress, len(clips.names))
-    run, results = replace(run, part=Part(), sequences_from=None, progress=None), list[Any]()
+    run = replace(run, part=Part(), sequences_from=None, progress=None)
+    results = list[Any]()
     if run.executor is not None:
         tasks = (replace(clips, names=(name,)) for name in clips.names)
         for done in run_all(_run_one, tasks, run, lost=_fail):

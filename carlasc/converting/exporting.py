@@ -590,7 +590,8 @@ class ExportRecord:
         Raises:
             ConflictError: a place holds something else.
         """
-        known, wanted = self._read().get(self._name, {}).get(self._product, {}), _plain(settings)
+        known = self._read().get(self._name, {}).get(self._product, {})
+        wanted = _plain(settings)
         for place, sequence in sequences.items():
             record = known.get(place)
             if record is None:

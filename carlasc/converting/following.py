@@ -120,7 +120,8 @@ def follow(
         raise ArgumentError("level", expected="False while the drive grows", found="True")
     if not isinstance(sink, FolderSink):
         raise ArgumentError("out", expected="a folder, while the drive grows", found=out)
-    poses, layout = replace(poses, source="kiss-icp"), replace(layout, boxes=None)
+    poses = replace(poses, source="kiss-icp")
+    layout = replace(layout, boxes=None)
     converter = open_converter(name, root, options)
     look = _Folder(converter, idle_s, say, wait)
     with own_processes(1) as maker:
@@ -270,7 +271,8 @@ class _Drive:
         self.plan = plan = plan_recording(
             recording, self.converter, self.sink, self.layout, self.poses, voxels=False
         )
-        before, observe = MadeFrom.read(plan.writer, CONVERSION), self.grids and self.grids.observe
+        before = MadeFrom.read(plan.writer, CONVERSION)
+        observe = self.grids and self.grids.observe
         if before == MadeFrom() and plan.writer.read_document(files.METADATA) is not None:
             raise ConflictError(
                 plan.writer.location,
@@ -373,7 +375,8 @@ class _Drive:
             return
         self._said = now
         behind_s = now - self.arrived[self._written - 1]
-        grids_s, every = now - self.arrived[last], (made[-1] - made[0]) / max(len(made) - 1, 1)
+        grids_s = now - self.arrived[last]
+        every = (made[-1] - made[0]) / max(len(made) - 1, 1)
         rate = f", of every {every:.0f}th scan" if every else ""
         self.folder.say(
             f"{count(self._written, 'scan')}, {behind_s:.1f} s behind the sensor; "

@@ -177,7 +177,9 @@ def map(
         raise ArgumentError("part", expected="none, as a map is one file", found=run.part)
     given_files = {name: path for name, path in vars(extras).items() if name != "actors"}
     files = MapFiles.of({"out": out, **given_files}, extras.actors, grid)
-    wanted, keep, options = FrameRange.of(frames), recording.keep, recording.options
+    wanted = FrameRange.of(frames)
+    keep = recording.keep
+    options = recording.options
     root, reader = None, None
     if (
         isinstance(source, Source)
@@ -203,10 +205,12 @@ def map(
         )
         of_places = source_states(root, recordings, options)
         states = {name: state for of in of_places.values() for name, state in of.items()}
-    first, settings = files.all[0], (cell_m, str(wanted), grid, [str(path) for path in files.all])
+    first = files.all[0]
+    settings = (cell_m, str(wanted), grid, [str(path) for path in files.all])
     record = MadeFrom(combined(settings, motion, poses, keep_parked, sorted(states.items())))
     keeper, kept = FolderWriter(first.parent), f"map-{first.name}"
-    is_ours, place = MadeFrom.read(keeper, kept) == record, first.parent / layout.DERIVED
+    is_ours = MadeFrom.read(keeper, kept) == record
+    place = first.parent / layout.DERIVED
     place /= f"recording-{first.name}"
     for path in (first, first.parent / layout.record_file(kept)):
         remove_stale_of(path)
@@ -240,7 +244,8 @@ def map(
                 found=f"none of {len(made.failures)}",
                 advice=" ".join(str(failure.message) for failure in made.failures[:1]),
             )
-        drive, poses = as_source(made.sequences[0]), replace(poses, source="file")
+        drive = as_source(made.sequences[0])
+        poses = replace(poses, source="file")
     try:
         if grid is None:
             spread = replace(run, progress=steps.stage())

@@ -403,7 +403,8 @@ def _some_scans(
     Raises:
         FormatError: none of them is a scan: the error of the first one.
     """
-    rig, frames = replace(Rig.of(recording), rays=False), frames or recording.frames
+    rig = replace(Rig.of(recording), rays=False)
+    frames = frames or recording.frames
     scans = dict[int, Float32Array]()
     problem: FormatError | None = None
     for row in sorted({*np.linspace(0, len(frames) - 1, _SCANS).astype(int).tolist()}):

@@ -58,7 +58,8 @@ def check_scan(points: Float32Array, seconds: AnyFloatArray | None, where: str) 
     distance = np.sort(np.sqrt(np.square(sample).sum(axis=1)))
     distance = distance[np.isfinite(distance)]
     if len(distance):
-        nearest, half = distance[len(distance) // 100], distance[len(distance) // 2]
+        nearest = distance[len(distance) // 100]
+        half = distance[len(distance) // 2]
         if half > _FARTHEST_M or nearest > _ALL_FAR_M:
             raise FormatError(
                 where,

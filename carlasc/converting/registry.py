@@ -229,7 +229,8 @@ def read_options(
         ArgumentError: an option does not exist, or cannot have that value.
         DependencyError: a declaration is not valid.
     """
-    options, known = options or {}, {one.name: one for one in option_declarations(kind)}
+    options = options or {}
+    known = {one.name: one for one in option_declarations(kind)}
     if unknown := sorted(set(options) - set(known)):
         expected = f"one of {', '.join(known)}" if known else "no options for this data set"
         raise ArgumentError("options", expected=expected, found=", ".join(unknown))

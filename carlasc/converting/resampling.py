@@ -47,7 +47,9 @@ class TargetFrame:
     def spec_in(self, spec: GridSpec, axes: Axes) -> GridSpec:
         """Return the geometry of a grid of the layout in this frame."""
         right = spec if axes == "right" else mirror_spec(spec)
-        (x0, y0, z0), (x1, y1, z1), (nx, ny, nz) = right.lower, right.upper, right.size
+        (x0, y0, z0) = right.lower
+        (x1, y1, z1) = right.upper
+        (nx, ny, nz) = right.size
         z0, z1 = z0 + self.height_m, z1 + self.height_m
         if self.forward == "x":
             return GridSpec("cartesian", (nx, ny, nz), (x0, y0, z0), (x1, y1, z1))
@@ -57,7 +59,9 @@ class TargetFrame:
         """Return the grid of the layout that has a geometry in this frame: the inverse of
         `spec_in`.
         """
-        (x0, y0, z0), (x1, y1, z1), (nx, ny, nz) = spec.lower, spec.upper, spec.size
+        (x0, y0, z0) = spec.lower
+        (x1, y1, z1) = spec.upper
+        (nx, ny, nz) = spec.size
         z0, z1 = z0 - self.height_m, z1 - self.height_m
         if self.forward == "x":
             right = GridSpec("cartesian", (nx, ny, nz), (x0, y0, z0), (x1, y1, z1))
@@ -111,7 +115,8 @@ def resample_to(
     places: list[IntArray] = []
     for axis, pair in enumerate(pairs):  # a cell may go to several voxels of the target
         kept, place = _targets_of(cells[axis][rows], pair, source.size[axis])
-        rows, places = rows[kept], [earlier[kept] for earlier in places] + [place]
+        rows = rows[kept]
+        places = [earlier[kept] for earlier in places] + [place]
     classes = labels[tuple(cell[rows] for cell in cells)]
     resampled = np.zeros(target.num_voxels, labels.dtype)
     voxels, winners = most_frequent(np.ravel_multi_index(tuple(places), target.size), classes)
@@ -202,7 +207,8 @@ def resampling_notes(source: GridSpec, target: GridSpec, name: str) -> list[str]
     if (np.array(source.lower) > target.lower + slack).any() or (
         np.array(source.upper) < target.upper - slack
     ).any():
-        low, high = (np.maximum(source.lower, target.lower), np.minimum(source.upper, target.upper))
+        low = np.maximum(source.lower, target.lower)
+        high = np.minimum(source.upper, target.upper)
         share = float(
             np.prod(np.maximum(high - low, 0)) / np.prod(np.subtract(target.upper, target.lower))
         )

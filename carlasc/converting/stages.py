@@ -144,7 +144,8 @@ class ScanStage:
         """
         fields: dict[str, AnyArray] = {}
         if job.write or self.for_odometry or self.for_actors:
-            scan, classes = read_scan(job.handle, self.rig, job.motion), self.target.source
+            scan = read_scan(job.handle, self.rig, job.motion)
+            classes = self.target.source
             if self.for_odometry:
                 frame.points = scan.points[usable_points(scan.points), :3]
             if self.for_actors and scan.labels is not None and scan.instances is not None:
@@ -489,7 +490,8 @@ class Conversion:
             return
         self.steps.expect(len(wanted))
         tracks, boxes = self._box_tracks()
-        blocks, stage = [], MotionStage(self.target, plan.writer, plan.rig, plan.flow)
+        blocks = []
+        stage = MotionStage(self.target, plan.writer, plan.rig, plan.flow)
         for part in in_blocks(wanted, plan.writer):
             near = None if tracks is None else _near(tracks, part, plan.poses)
             jobs = [
@@ -591,7 +593,8 @@ class Conversion:
 
     def _remarks(self) -> list[str]:
         plan = self.plan
-        notes, every = [*plan.recording.notes(), *plan.notes], len(plan.recording.frames)
+        notes = [*plan.recording.notes(), *plan.notes]
+        every = len(plan.recording.frames)
         if 0 < (existing := every - len(plan.unfinished)) < every:
             notes.append(f"an earlier run was continued: {existing} of {every} frames existed")
         if self.waits:
@@ -616,7 +619,8 @@ class Conversion:
                 f"{self._unnumbered} moving points belong to no numbered actor; their flow is "
                 f"unknown and set to 0"
             )
-        first, last = plan.recording.frames[0].number, plan.recording.frames[-1].number
+        first = plan.recording.frames[0].number
+        last = plan.recording.frames[-1].number
         every = last - first + 1
         if gaps := every - len(plan.recording.frames):
             notes.append(f"{gaps} of the {every} frames from {first} to {last} have no scan")

@@ -146,7 +146,8 @@ class CameraModel:
                 radius = np.hypot(x, y)
                 angle = np.arctan2(radius, z)
                 scale = np.where(radius > 0, angle / radius, 1.0)
-                plane, outside = np.stack([x * scale, y * scale], axis=1), angle > self._widest
+                plane = np.stack([x * scale, y * scale], axis=1)
+                outside = angle > self._widest
             else:
                 plane = np.stack([x / z, y / z], axis=1)
                 outside = ~(z > 0) | (np.square(plane).sum(axis=1) > self._widest**2)

@@ -219,7 +219,9 @@ def numbered(cells: IntArray) -> tuple[IntArray, IntArray]:
         size *= 2
     # 1 + the number of each cell, at the hash of the cell or after it
     table = np.zeros(size, np.int64)
-    first, number, count = np.empty(len(cells), np.int64), np.empty(len(cells), np.int64), 0
+    first = np.empty(len(cells), np.int64)
+    number = np.empty(len(cells), np.int64)
+    count = 0
     for i in range(len(cells)):
         code = 0
         for axis in range(cells.shape[1]):
@@ -298,7 +300,9 @@ def find_crossing(
         box: (2, 3) lower and upper corner, metres.
         turn: number of steps of azimuth in a turn.
     """
-    found, places, count = np.empty(len(points), np.int64), np.empty((len(points), 3)), 0
+    found = np.empty(len(points), np.int64)
+    places = np.empty((len(points), 3))
+    count = 0
     reached, begin = np.empty(len(ends), np.int64), 0
     for k in range(len(ends)):
         pose, own = pose_of(poses, k), azimuth[begin : ends[k]]
@@ -338,7 +342,8 @@ def _seen_from(pose: Pose, box: FloatArray) -> tuple[float, float]:
         z = box[corner >> 2, 2] - pose[11]
         along = pose[0] * x + pose[4] * y + pose[8] * z
         angles[corner] = math.atan2(pose[1] * x + pose[5] * y + pose[9] * z, along)
-        sine, cosine = sine + math.sin(angles[corner]), cosine + math.cos(angles[corner])
+        sine = sine + math.sin(angles[corner])
+        cosine = cosine + math.cos(angles[corner])
     middle = math.atan2(sine, cosine)
     for angle in angles:
         half = max(half, abs((angle - middle + math.pi) % (2 * math.pi) - math.pi))
@@ -352,9 +357,11 @@ def _intersects(end: Triple, pose: Pose, box: FloatArray) -> bool:
     for axis in range(3):
         origin = pose[4 * axis + 3]
         along = end[axis] - origin
-        one, other = (box[0, axis] - origin) / along, (box[1, axis] - origin) / along
+        one = (box[0, axis] - origin) / along
+        other = (box[1, axis] - origin) / along
         # A ray in the plane of a face gives 0/0: fmin and fmax ignore the NaN.
-        enter, leave = max(enter, np.fmin(one, other)), min(leave, np.fmax(one, other))
+        enter = max(enter, np.fmin(one, other))
+        leave = min(leave, np.fmax(one, other))
     return (enter <= leave) & (leave >= 0.0) & (enter <= 1.0)
 
 

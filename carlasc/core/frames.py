@@ -88,7 +88,8 @@ class FrameRange:
         """
         first, colon, last = text.partition(":")
         try:
-            start, stop = int(first) if first else None, int(last) if last else None
+            start = int(first) if first else None
+            stop = int(last) if last else None
         except ValueError:
             raise ArgumentError(
                 "frames", expected="A:B, A:, :B or a frame number", found=repr(text)

@@ -52,7 +52,8 @@ def multiply(*matrices: AnyFloatArray) -> FloatArray:
     """
     product = np.asarray(matrices[0], np.float64)
     for matrix in matrices[1:]:
-        left, product = product, product[..., :, 0, None] * matrix[..., None, 0, :]
+        left = product
+        product = product[..., :, 0, None] * matrix[..., None, 0, :]
         for k in range(1, matrix.shape[-2]):
             product = product + left[..., :, k, None] * matrix[..., None, k, :]
     return product
@@ -156,8 +157,12 @@ def quaternions_of(rotations: AnyFloatArray) -> FloatArray:
     """
     r = np.asarray(rotations, np.float64)
     xx, yy, zz = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
-    wx, wy, wz = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]
-    xy, xz, yz = r[:, 0, 1] + r[:, 1, 0], r[:, 0, 2] + r[:, 2, 0], r[:, 1, 2] + r[:, 2, 1]
+    wx = r[:, 2, 1] - r[:, 1, 2]
+    wy = r[:, 0, 2] - r[:, 2, 0]
+    wz = r[:, 1, 0] - r[:, 0, 1]
+    xy = r[:, 0, 1] + r[:, 1, 0]
+    xz = r[:, 0, 2] + r[:, 2, 0]
+    yz = r[:, 1, 2] + r[:, 2, 1]
     # Each row is 4 q_k (w, x, y, z) for one k; the longest is farthest from a division by zero.
     candidates = np.array(
         [

@@ -86,7 +86,8 @@ class GridSpec:
                 found=" x ".join(map(str, self.size)),
                 advice="use a coarser resolution",
             )
-        cylindrical, turn = self.coordinates == "cylindrical", self.upper[1] - self.lower[1]
+        cylindrical = self.coordinates == "cylindrical"
+        turn = self.upper[1] - self.lower[1]
         bounds = f"{self.lower} and {self.upper}"
         for wrong, name, expected, found in (
             (min(self.size) < 1, "size", "at least one cell per axis", self.size),
@@ -156,7 +157,8 @@ class GridSpec:
             size = [float(v) for v in params["grid_size"]]
             if any(v != int(v) for v in size):
                 raise FormatError(where, expected="integers in grid_size", found=size)
-            lower, upper = _three(params["min_bound"]), _three(params["max_bound"])
+            lower = _three(params["min_bound"])
+            upper = _three(params["max_bound"])
             return cls(params["coordinates"], _three(map(int, size)), lower, upper)
         except FormatError:
             raise  # a FormatError is a ValueError
@@ -211,7 +213,9 @@ class GridSpec:
                 expected="one or three positive numbers",
                 found=", ".join(map(str, per_axis)),
             )
-        size, lower, upper = list(self.size), list(self.lower), list(self.upper)
+        size = list(self.size)
+        lower = list(self.lower)
+        upper = list(self.upper)
         for axis, step in enumerate(per_axis * (3 // len(per_axis))):
             width = self.upper[axis] - self.lower[axis]
             cells = _cells(width, step)

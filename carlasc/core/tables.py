@@ -406,7 +406,8 @@ def classes_from(value: object, where: str) -> tuple[ClassTable, Remap | None]:
     if not isinstance(value, Mapping) or not {"map", "from"} & value.keys():
         return table_from_json(value, where), None
     values = dict(value)
-    mapping, source = values.pop("map", {}), table_from_json(values.pop("from", CARLA.name), where)
+    mapping = values.pop("map", {})
+    source = table_from_json(values.pop("from", CARLA.name), where)
     table = table_from_json(values, where)
     try:
         ids = id_map(mapping) if isinstance(mapping, str) else mapping

@@ -471,7 +471,8 @@ class InputCheck:
         """Whether the grid was made from this input, of which some frames changed since: most
         others are as they were.
         """
-        before, files = MadeFrom.read(self.writer, self._name).own, self.inputs.files()
+        before = MadeFrom.read(self.writer, self._name).own
+        files = self.inputs.files()
         if files is None or self.compare == "never":
             return False
         now = self._own_of(content_digests(files, self.inputs.depended()))
@@ -530,7 +531,8 @@ class InputCheck:
             or record.frames.get(str(frame), ACCEPTED) == ACCEPTED
         }
         # only a run that ends says that all frames and the report are of these inputs
-        record.own, record.whole = self._own, "" if self.changed or self.stale else self._whole
+        record.own = self._own
+        record.whole = "" if self.changed or self.stale else self._whole
         record.write(self.writer, self._name)
 
     def _remove_others(self) -> None:

@@ -73,7 +73,9 @@ class _GrowingDrive:
 
     def __init__(self, sequence: Sequence, plan: GridPlan, writer: SequenceWriter) -> None:
         observe = cast(FromScans, plan.observe)
-        self.plan, self.writer, (self.first, self.last) = plan, writer, observe.window
+        self.plan = plan
+        self.writer = writer
+        (self.first, self.last) = observe.window
         if observe.motion.source != "none":
             observe = replace(observe, motion=replace(observe.motion, source="evidence"))
         self.feed = feed = ScanFeed(sequence, observe)
@@ -145,7 +147,9 @@ class _GrowingDrive:
         Raises:
             ConflictError: the grid is not one of carlasc's.
         """
-        plan, writer, document = self.plan, self.writer, layout.params_file(self.plan.grid)
+        plan = self.plan
+        writer = self.writer
+        document = layout.params_file(self.plan.grid)
         inputs = ScanSequence(self.feed.sequence, plan, cast(FromScans, plan.observe))
         params = settings_of(inputs, plan)
         check_grid(writer, plan.grid, params, [number], overwrite=True)

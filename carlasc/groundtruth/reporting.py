@@ -280,7 +280,9 @@ class FrameFacts:
         digests = {name: digest_of(name, array) for name, array in arrays.items()}
         labels = np.asarray(arrays[f"{grid}/labels"]).reshape(-1)
         counts = arrays.get(f"{grid}/counts")
-        votes, votes_sum, known = np.zeros(POWERS, np.int64), 0.0, np.ones(len(labels), np.bool_)
+        votes = np.zeros(POWERS, np.int64)
+        votes_sum = 0.0
+        known = np.ones(len(labels), np.bool_)
         if counts is not None:
             seen = np.asarray(counts).reshape(-1)
             known = seen > 0
@@ -623,7 +625,8 @@ def _coverage(rows: list[FrameFacts], settings: Mapping[str, Any], classes: Clas
         (row.classes for row in rows), start=np.zeros(classes.num_channels, np.int64)
     )
     votes = sum((row.votes for row in rows), start=np.zeros(1, np.int64))
-    known, total = sum(row.known for row in rows), sum(row.votes_sum for row in rows)
+    known = sum(row.known for row in rows)
+    total = sum(row.votes_sum for row in rows)
     voxels = len(rows) * int(np.prod(settings["grid_size"], dtype=np.int64))
     return Coverage(
         voxels=voxels,

@@ -451,8 +451,12 @@ class FrameTask:
             MissingDataError: the plan needs the certainty of each voxel, and the frame does not
                 have it.
         """
-        plan, voting, where = self.plan, self.plan.voting, f"frame {self.number}"
-        labels, counts, evidence = data.grid.labels, data.grid.counts, data.evidence
+        plan = self.plan
+        voting = self.plan.voting
+        where = f"frame {self.number}"
+        labels = data.grid.labels
+        counts = data.grid.counts
+        evidence = data.evidence
         if plan.needs_evidence and evidence is None:
             raise MissingDataError(where, expected="how certain each voxel is", found="nothing")
         if voting.min_confidence and counts is not None and evidence is not None:
@@ -674,7 +678,8 @@ class SequenceJob:
 
     def tasks(self, numbers: Set[int], existing: SequenceWriter | None = None) -> list[FrameTask]:
         """Return a task for each of some frames; `existing`: where they are already."""
-        sampled, inputs = set(sample_frames(sorted(self.reported))), self.inputs
+        sampled = set(sample_frames(sorted(self.reported)))
+        inputs = self.inputs
         known = {frame.number: frame for frame in inputs.frames}
         return [
             FrameTask(
@@ -692,7 +697,9 @@ class SequenceJob:
     def write_report(self, results: Series[FrameResult]) -> None:
         """Write the report, if anything was made or measured."""
         facts = [done.facts for done in results if done.facts is not None]
-        grid, writer, documents = self.plan.grid, self.writer, self._documents()
+        grid = self.plan.grid
+        writer = self.writer
+        documents = self._documents()
         if facts:
             inputs = self.inputs
             report = Report.make(

@@ -100,8 +100,10 @@ def see_voxels(
         (X, Y, Z) uint8: bit i is set where camera i sees the voxel. Its centre is in the image.
     """
     seen = np.zeros(spec.num_voxels, np.uint8)
-    solid, centers = _Solid.of(occupied, spec, boxes), spec.centers().reshape(-1, 3)
-    lower, edge = np.array(spec.lower, np.float64), np.array(spec.voxel_size, np.float64)
+    solid = _Solid.of(occupied, spec, boxes)
+    centers = spec.centers().reshape(-1, 3)
+    lower = np.array(spec.lower, np.float64)
+    edge = np.array(spec.voxel_size, np.float64)
     for bit, (camera, place) in enumerate(views):
         if place is None:
             continue
@@ -155,7 +157,8 @@ def see_points(
         spec: the grid, which is Cartesian.
         eye: (3,) position of the eye, metres, in the frame of the grid.
     """
-    lower, edge = np.array(spec.lower, np.float64), np.array(spec.voxel_size, np.float64)
+    lower = np.array(spec.lower, np.float64)
+    edge = np.array(spec.voxel_size, np.float64)
     reached = np.empty(len(points), np.bool_)
     cells = (np.asarray(points, np.float64) - lower) / edge
     _reach_points(cells, (eye - lower) / edge, _Solid.of(occupied, spec), reached)
@@ -169,7 +172,9 @@ def _reach_points(points, eye, solid, reached):  # type: ignore[no-untyped-def]
     for n in range(len(points)):
         reached[n] = False
         for raised in range(2):
-            at_x, at_y, at_z = points[n, 0], points[n, 1], points[n, 2] + raised
+            at_x = points[n, 0]
+            at_y = points[n, 1]
+            at_z = points[n, 2] + raised
             ray_x, ray_y, ray_z = eye[0] - at_x, eye[1] - at_y, eye[2] - at_z
             far = max(abs(ray_x), abs(ray_y), abs(ray_z))
             # from this share of the ray on, voxels hide the point
@@ -183,8 +188,12 @@ def _reach_points(points, eye, solid, reached):  # type: ignore[no-untyped-def]
                     edge = 1e-9 if at < 0 else last - 1e-9
                     share = (edge - at) / ray if ray != 0 else 2.0
                     first = max(first, share if share > 0 else 2.0)
-            at_x, at_y, at_z = at_x + first * ray_x, at_y + first * ray_y, at_z + first * ray_z
-            x, y, z = int(np.floor(at_x)), int(np.floor(at_y)), int(np.floor(at_z))
+            at_x = at_x + first * ray_x
+            at_y = at_y + first * ray_y
+            at_z = at_z + first * ray_z
+            x = int(np.floor(at_x))
+            y = int(np.floor(at_y))
+            z = int(np.floor(at_z))
             is_outside = x < 0 or y < 0 or z < 0 or x >= size[0] or y >= size[1] or z >= size[2]
             if first >= 1.0 or is_outside or _reaches((at_x, at_y, at_z), eye, (x, y, z), solid):
                 reached[n] = True
@@ -250,5 +259,6 @@ def _is_stopped(at, ray, cell, voxel, solid):  # type: ignore[no-untyped-def]
         low = cell[axis] + boxes[voxel, axis] / STEPS - solid.beyond[axis] - at[axis]
         high = cell[axis] + (1.0 + boxes[voxel, 3 + axis]) / STEPS + solid.beyond[axis] - at[axis]
         enter, leave = low / ray[axis], high / ray[axis]
-        first, last = max(first, min(enter, leave)), min(last, max(enter, leave))
+        first = max(first, min(enter, leave))
+        last = min(last, max(enter, leave))
     return first < last

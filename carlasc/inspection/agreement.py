@@ -50,7 +50,9 @@ class GroundBelow:
 
         Those outside of the grid's other bounds do not count.
         """
-        axes, lower, upper = self.spec.to_axes(ground), self.spec.lower, self.spec.upper
+        axes = self.spec.to_axes(ground)
+        lower = self.spec.lower
+        upper = self.spec.upper
         inside = ((axes[:, :2] >= lower[:2]) & (axes[:, :2] < upper[:2])).all(axis=1)
         self._heights.append(ground[inside, 2])
 

@@ -368,7 +368,8 @@ def measure_overlap(
     for first in np.unique(np.linspace(0, len(poses) - 2, _LONG_PAIRS).astype(int)).tolist():
         away = np.linalg.norm(poses[first:, :3, 3] - poses[first, :3, 3], axis=1) > REACH_M
         last = first + int(away.argmax()) if away.any() else len(poses) - 1
-        target, moved = structure(first), _thin(structure(last), _OFFSET_POINTS)
+        target = structure(first)
+        moved = _thin(structure(last), _OFFSET_POINTS)
         if min(len(target), len(moved)) < _MIN_POINTS:
             continue
         here, motion = poses[first : first + 1], relative(poses, first, last)

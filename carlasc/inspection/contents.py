@@ -127,7 +127,8 @@ def check_frames(sequence: Sequence) -> Iterator[Finding]:
     for grid in sorted({name.rpartition("/")[0] for name in fields if "/" in name}):
         parts = [part for part in layout.GRID_FIELDS if f"{grid}/{part}" in fields]
         if "labels" not in parts:
-            found, where = f"only {', '.join(parts)}", f"{sequence.location}/{grid}"
+            found = f"only {', '.join(parts)}"
+            where = f"{sequence.location}/{grid}"
             yield Finding("error", "frame-counts", where, "labels of the grid", found)
             continue
         labels = f"{grid}/labels"
@@ -249,7 +250,8 @@ def _check_grid(
         yield from _check_classes(labels, classes, _file(sequence, f"{grid}/labels", frame))
     if f"{grid}/counts" not in arrays:
         return
-    counts, file = arrays[f"{grid}/counts"], _file(sequence, f"{grid}/counts", frame)
+    counts = arrays[f"{grid}/counts"]
+    file = _file(sequence, f"{grid}/counts", frame)
     right = (counts >= 0) & (counts == np.floor(counts)) & np.isfinite(counts)
     for expected, found in _others(counts, right, "whole numbers of votes, 0 or more"):
         yield Finding("error", "counts", file, expected, found)
@@ -304,7 +306,8 @@ def _mistakes(
         most = sum(VoxelFlag)
         yield from _others(array, array <= most, f"flags of 0 to {most}")
     elif part == "velocity":
-        voxels, finite = array["voxel"].astype(np.int64), np.isfinite(array["velocity"]).all(axis=1)
+        voxels = array["voxel"].astype(np.int64)
+        finite = np.isfinite(array["velocity"]).all(axis=1)
         inside = (voxels >= 0) & (voxels < num_voxels)
         if not (inside.all() and (np.diff(voxels) > 0).all()):
             yield f"rising voxels from 0 to {num_voxels - 1}", "others"
@@ -318,7 +321,8 @@ def _mistakes(
             expected = f"class ids of {classes.name} other than 0"
             yield from _others(array["label"], named, expected, "rows")
         voxels, place = np.unique(array["voxel"][inside], return_inverse=True)
-        sums, rows = np.bincount(place, array["votes"][inside], len(voxels)), np.bincount(place)
+        sums = np.bincount(place, array["votes"][inside], len(voxels))
+        rows = np.bincount(place)
         # Each probability is rounded.
         if len(large := np.flatnonzero(sums > layout.CERTAIN + 0.5 * rows)):
             found = f"{sums[large[0]]:.0f} in voxel {voxels[large[0]]}"

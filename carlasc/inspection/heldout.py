@@ -192,7 +192,8 @@ def holdout(
     failures = []
     with closing(run_all(_measure, tasks, run, lost=lambda _, message: message)) as results:
         for (drive, frame), outcome in zip(measured, results, strict=True):
-            totals, path = scores if drive.is_used else before, drive.inputs.path
+            totals = scores if drive.is_used else before
+            path = drive.inputs.path
             if not isinstance(outcome, str):
                 totals[path] = totals[path].merge(outcome) if path in totals else outcome
             elif drive.is_used:

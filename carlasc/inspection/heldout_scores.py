@@ -132,16 +132,20 @@ class HeldOutScores:
         """
         spec, occupied = grid.spec, grid.known & (grid.labels != 0)
         if labels is None:
-            ground, kinds = lowest_of_columns(occupied), np.full(len(points), classes.geometry_id)
+            ground = lowest_of_columns(occupied)
+            kinds = np.full(len(points), classes.geometry_id)
         else:
-            ground, kinds = np.isin(grid.labels, sorted(classes.ground)), labels.astype(np.int64)
+            ground = np.isin(grid.labels, sorted(classes.ground))
+            kinds = labels.astype(np.int64)
         solid = np.where(occupied, np.where(ground, _SOLID, _SOLID | _OBJECT), 0).astype(np.uint8)
         at_points = labels_at(points, spec, grid.labels, grid.known)
         inside = (at_points != OUTSIDE) & np.any(points != 0, axis=1)
         begun = np.zeros_like(points) if origins is None else origins
-        ends, begun = points[inside].astype(np.float64), begun[inside].astype(np.float64)
+        ends = points[inside].astype(np.float64)
+        begun = begun[inside].astype(np.float64)
         first, passed = _follow(solid, spec, begun, ends)
-        ranges, at_points = np.linalg.norm(ends - begun, axis=1), at_points[inside]
+        ranges = np.linalg.norm(ends - begun, axis=1)
+        at_points = at_points[inside]
         missed = np.isinf(first)
         cells = kinds[inside], np.searchsorted(BANDS_M, ranges, side="right") - 1
         free, unknown = at_points == 0, at_points == UNKNOWN
@@ -231,7 +235,8 @@ def swept_voxels(spec: GridSpec, grid_T_vehicles: Iterable[Transform]) -> BoolAr
     """
     centers, (lower, upper) = spec.centers(), np.array(VEHICLE_M)
     axes = (centers[:, 0, 0, 0], centers[0, :, 0, 1], centers[0, 0, :, 2])
-    swept, reach_m = np.zeros(spec.size, np.bool_), np.linalg.norm(np.abs(VEHICLE_M).max(axis=0))
+    swept = np.zeros(spec.size, np.bool_)
+    reach_m = np.linalg.norm(np.abs(VEHICLE_M).max(axis=0))
     for pose in grid_T_vehicles:
         near = np.ix_(
             *(np.abs(axis - at) < reach_m for axis, at in zip(axes, pose[:3, 3], strict=True))

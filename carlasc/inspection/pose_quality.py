@@ -74,7 +74,9 @@ def measure_poses(
     times = np.asarray(
         layout.FRAME_PERIOD_S * np.arange(len(poses)) if seconds is None else seconds, np.float64
     )
-    before, after, runs = list[float](), list[float](), list[tuple[int, FloatArray]]()
+    before = list[float]()
+    after = list[float]()
+    runs = list[tuple[int, FloatArray]]()
     numbers = np.arange(len(poses), dtype=np.float64)
     for first in _choose_runs(poses, times):
         rows = slice(first, first + _RUN)
@@ -82,7 +84,8 @@ def measure_poses(
         for row in range(len(poses))[rows]:  # in Python 3.11, a comprehension is a level of calls
             thinned = ThinnedScan.of(points(row).astype(np.float32), poses[row])
             scans.append(thinned)
-        used, measured = [scan.used for scan in scans], [scan.measured for scan in scans]
+        used = [scan.used for scan in scans]
+        measured = [scan.measured for scan in scans]
         was = finite_mean(disagreement(measured, poses[rows]))
         aligned = align(used, poses[rows], poses[rows])
         now = finite_mean(disagreement(measured, aligned))
@@ -174,7 +177,8 @@ def check_poses(sequence: Sequence) -> Iterator[Finding]:
     """Check that poses.txt exists, has a line for each frame, and holds rigid transforms that
     change smoothly.
     """
-    where, frames = f"{sequence.location}/{layout.POSES}", sequence.scan_frames()
+    where = f"{sequence.location}/{layout.POSES}"
+    frames = sequence.scan_frames()
     if layout.POSES not in sequence.documents():
         if "points" in sequence.fields():
             yield Finding(

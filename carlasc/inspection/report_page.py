@@ -45,7 +45,9 @@ def write_report_page(result: ReportResult, out: str | Path) -> None:
 
 def describe(report: Report) -> list[tuple[str, str]]:
     """Return the content of a report, as pairs of a name and a text."""
-    coverage, convergence, frames = report.coverage, report.convergence, report.frames
+    coverage = report.coverage
+    convergence = report.convergence
+    frames = report.frames
     span = f" ({frames[0]} to {frames[-1]})" if frames else ""
     rows = {
         "frames": f"{len(frames)}{span}",
@@ -197,7 +199,8 @@ def _timeline(actors: Sequence[ActorTrack], frames: Sequence[int]) -> str:
     scale = 560 / max(last - first, 1)
     lines = []
     for row, actor in enumerate(actors):
-        name, length = f"{actor.label} {actor.instance or ''}".strip(), actor.last - actor.first
+        name = f"{actor.label} {actor.instance or ''}".strip()
+        length = actor.last - actor.first
         opacity = f' fill-opacity="{actor.observations / (length + 1):.2f}"'
         x, width = 130 + (actor.first - first) * scale, max(length * scale, 2)
         lines += _bar(row, name, x, width, opacity)
@@ -275,7 +278,8 @@ def write_audit_page(result: AuditResult, out: str | Path) -> None:
     parts = []
     for path, verdicts in result.verdicts.items():
         rows = "".join(map(_row, sorted(verdicts, key=lambda v: STATES.index(v.state))))
-        placed, frames = escape(result.placed[path]), count(result.frames[path], "frame")
+        placed = escape(result.placed[path])
+        frames = count(result.frames[path], "frame")
         about = f"{frames}; coordinate frame of the grids: {placed}."
         head = "<tr><th>check</th><th>verdict</th><th>what was found</th><th>what to do</th></tr>"
         parts.append(f"<h2>{escape(path)}</h2><p>{about}</p><table>{head}{rows}</table>")

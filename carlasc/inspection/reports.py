@@ -213,14 +213,16 @@ class _ReportMaker:
         documents = {
             name: sequence.read_document(name) for name in names if name in sequence.documents()
         }
-        classes, params = sequence.classes_of(self.grid), sequence.params(self.grid)
+        classes = sequence.classes_of(self.grid)
+        params = sequence.params(self.grid)
         actors = None if inputs is None else inputs.summaries()
         poses = None if inputs is None else inputs.pose_facts()
         made = Report.make(self.grid, facts, params, classes, documents, actors=actors, poses=poses)
         return made, failures
 
     def _tasks(self) -> Iterator[_ReportedFrame]:
-        light, sampled = without_caches(self.sequence), sample_frames(self.frames)
+        light = without_caches(self.sequence)
+        sampled = sample_frames(self.frames)
         for number in self.frames:
             scans = None if self.inputs is None else self.inputs.frame(number)
             plan = self.inputs.plan if self.inputs is not None and number in sampled else None
@@ -309,7 +311,9 @@ def _measure(task: _ReportedFrame) -> FrameFacts | FrameFailure:
             for n in names
             if n in present and number in sequence.frames(n)
         }
-        spec, classes, changes = sequence.grids[grid], sequence.classes_of(grid), None
+        spec = sequence.grids[grid]
+        classes = sequence.classes_of(grid)
+        changes = None
         residuals = None if task.scans is None else task.scans.residuals()
         thinned = None
         if task.scans is not None and task.plan is not None:

@@ -80,7 +80,8 @@ class ScanFacts:
                     f"{sequence.location}/{grid}",
                     f"none in {empty} of {len(occupied)} frames",
                 )
-                expected, advice = CHECKS[OCCUPIED], "check the bounds of the grid"
+                expected = CHECKS[OCCUPIED]
+                advice = "check the bounds of the grid"
                 yield Finding("warning", OCCUPIED, where, expected, found, advice)
         where = f"{sequence.location}/points"
         if not self._far:
@@ -143,7 +144,8 @@ def judge(
     entries = _entries(sequence)
     before = [check for check, (verdict, _) in entries.items() if verdict == ACCEPTED]
     states: dict[str, State] = {**dict.fromkeys(made, "right"), **dict.fromkeys(before, ACCEPTED)}
-    where, expected = f"{sequence.location}/{layout.METADATA}", "a recording without warnings"
+    where = f"{sequence.location}/{layout.METADATA}"
+    expected = "a recording without warnings"
     warned = [
         Finding("warning", check, where, expected, message, _accept(check))
         for check, (verdict, message) in entries.items()

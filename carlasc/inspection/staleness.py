@@ -70,7 +70,8 @@ def check_sample(sequence: Sequence, count: int, run: Run) -> Iterator[Finding]:
     from carlasc.inspection.reports import inputs_of
 
     for grid in sequence.grids:
-        inputs, where = inputs_of(sequence, grid), f"{sequence.location}/{grid}"
+        inputs = inputs_of(sequence, grid)
+        where = f"{sequence.location}/{grid}"
         frames = sequence.frames(f"{grid}/labels")
         if inputs is None or not len(frames):
             continue
@@ -92,7 +93,8 @@ def check_sample(sequence: Sequence, count: int, run: Run) -> Iterator[Finding]:
         if different:
             found = f"{found}, the first is {different[0]}"
         kind: Severity = "warning" if different else "note"
-        expected, advice = "what is made of the scans now", _ADVICE if different else ""
+        expected = "what is made of the scans now"
+        advice = _ADVICE if different else ""
         yield Finding(kind, "inputs", where, expected, found, advice)
 
 
@@ -104,7 +106,8 @@ def record_inputs(sequence: Sequence) -> Iterator[Finding]:
         ArgumentError: such a grid is not in a folder.
     """
     for grid in sequence.grids:
-        frames, record = sequence.frames(f"{grid}/labels").tolist(), _record(sequence, grid)
+        frames = sequence.frames(f"{grid}/labels").tolist()
+        record = _record(sequence, grid)
         unknown = [frame for frame in frames if str(frame) not in record.frames]
         now = _own_now(sequence, grid, record)
         if not unknown or not now or changed_inputs(sequence, grid):
@@ -116,7 +119,8 @@ def record_inputs(sequence: Sequence) -> Iterator[Finding]:
         accepted_record = MadeFrom(record.whole, record.own or now, record.frames | accepted)
         accepted_record.write(FolderWriter(sequence.folder), f"made-{grid}")
         found = f"none of {count(len(unknown), 'frame')}: they count as made of the inputs of now"
-        where, expected = f"{sequence.location}/{grid}", "a record of what frames were made from"
+        where = f"{sequence.location}/{grid}"
+        expected = "a record of what frames were made from"
         yield Finding("note", "inputs", where, expected, found)
 
 

@@ -259,7 +259,8 @@ def stats(
         sequences = {path: one.with_classes(given) for path, one in sequences.items()}
     tasks = [task for sequence in sequences.values() for task in _tasks(sequence, grid, every)]
     if not tasks:
-        expected, advice = f"labels of points or the grid {grid}", "name another grid with `grid`"
+        expected = f"labels of points or the grid {grid}"
+        advice = "name another grid with `grid`"
         raise MissingDataError(opened.location, expected=expected, found="neither", advice=advice)
     classes = _common_table(tasks, opened.location)
     target = _choose_remap(remap, classes)
@@ -328,7 +329,8 @@ def _failures(task: _Task, message: str) -> list[tuple[str, str]]:
 def _count_frame(
     sequence: Sequence, field: str, frame: int, classes: ClassTable, allow_unknown: bool
 ) -> Histogram:
-    where, stored = f"{sequence.location}: {field} of frame {frame}", _table_of(sequence, field)
+    where = f"{sequence.location}: {field} of frame {frame}"
+    stored = _table_of(sequence, field)
     labels = sequence.read(field, frame)
     labels, unlisted = labels.reshape(-1), Counter[int]()
     listed = np.ones(labels.shape, np.bool_)

@@ -252,7 +252,9 @@ def _examine(plan: _CheckedFrames, step: Callable[[], None] = lambda: None) -> _
     for frame in plan.opened:
         findings.extend(check_shapes(sequence, frame, with_grids=described))
         step()
-    facts, evidence, below = ScanFacts(), dict[str, GridEvidence](), dict[str, GroundBelow]()
+    facts = ScanFacts()
+    evidence = dict[str, GridEvidence]()
+    below = dict[str, GroundBelow]()
     for frame in plan.read:
         if described:
             findings.extend(check_values(sequence, frame))
@@ -411,7 +413,8 @@ def _judge_grid(
                 f", but {diagnosis.occupied_share:.1%} in occupied voxels; the likely cause is "
                 "labels of another class table, or in another order"
             )
-    where, expected = f"{sequence.location}/{grid}", "points in voxels of their class"
+    where = f"{sequence.location}/{grid}"
+    expected = "points in voxels of their class"
     yield Finding(severity, "scan-in-voxels", where, expected, share + cause, advice)
 
 
@@ -465,7 +468,8 @@ def _judge_poses(
             "--poses kiss-icp`"
         )
     elif quality is not None and quality.is_poor:
-        check, expected = "pose-jitter", "scans that agree with their neighbours"
+        check = "pose-jitter"
+        expected = "scans that agree with their neighbours"
         found = (
             f"scans that are {100 * (quality.disagreement_m or 0):.1f} cm from the surfaces that "
             "their neighbours saw; under refined poses "

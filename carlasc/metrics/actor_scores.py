@@ -70,7 +70,9 @@ class ActorScores:
 
     def __init__(self, convention: Convention) -> None:
         self.convention = convention
-        k, free, table = convention.num_classes, convention.free, convention.usual_truth
+        k = convention.num_classes
+        free = convention.free
+        table = convention.usual_truth
         scored = set(convention.averaged) - {free}
         mapping = convention.maps[table.name]
         things = frozenset({mapping[i] for i in table.movable if i in mapping} & scored)

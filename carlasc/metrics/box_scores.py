@@ -145,7 +145,8 @@ def evaluate_boxes(
     place = table.frames_of(times, poses, where, sequence.location)
     gathered = []
     for index, frame in enumerate(frames):
-        own, world = np.flatnonzero(place == index), boxes[frame].transform(poses[index])
+        own = np.flatnonzero(place == index)
+        world = boxes[frame].transform(poses[index])
         values, axes = table.values[own], world.sensor_T_box[:, :2, 0]
         local = transform_points(invert(poses[index]), values[:, :3])
         inside = [
@@ -187,7 +188,8 @@ def _score(frames: list[_Frame], objects: str, threshold: float) -> BoxScore:
     heading, velocity = list[float](), list[float]()
     ranked = list[tuple[float, bool]]()  # confidence, and whether it is right
     for frame in frames:
-        wanted, good = frame.scored & (frame.moving | (objects == "all")), frame.iou >= threshold
+        wanted = frame.scored & (frame.moving | (objects == "all"))
+        good = frame.iou >= threshold
         kept = np.array([[before.get(t) == d for d in frame.found] for t in frame.truth])
         gain = np.where(good, frame.iou + _KEPT * kept.reshape(good.shape), 0)
         rows, columns = assign(gain, maximize=True)

@@ -129,9 +129,12 @@ def follow_rays(
         ArgumentError: the grid is cylindrical.
     """
     check_cartesian(spec)
-    ends, lower, voxel = np.asarray(points, np.float64), np.array(spec.lower), spec.voxel_size
+    ends = np.asarray(points, np.float64)
+    lower = np.array(spec.lower)
+    voxel = spec.voxel_size
     first, passed = np.full(len(ends), np.inf), np.zeros(len(ends), np.uint8)
-    start, size = (np.asarray(origin, np.float64) - lower) / voxel, np.array(spec.size)
+    start = (np.asarray(origin, np.float64) - lower) / voxel
+    size = np.array(spec.size)
     lengths = np.linalg.norm(ends - origin, axis=1)
     _follow(
         np.ascontiguousarray(solid), size, start, (ends - lower) / voxel, lengths, first, passed
@@ -145,7 +148,9 @@ def _follow(solid, size, start, ends, lengths, first, passed):  # type: ignore[n
 
     The parameter t is 0 at the origin and 1 at the point.
     """
-    step, cell, last = np.empty(3), np.empty(3, np.int64), np.empty(3, np.int64)
+    step = np.empty(3)
+    cell = np.empty(3, np.int64)
+    last = np.empty(3, np.int64)
     crossing, between = np.empty(3), np.empty(3)
     for r in range(len(ends)):
         inside = True
@@ -210,7 +215,9 @@ def _cast(solid, size, starts, steps, voxels, depth):  # type: ignore[no-untyped
             i = min(max(int(np.floor(x + entry * dx)), 0), nx - 1)
             j = min(max(int(np.floor(y + entry * dy)), 0), ny - 1)
             k = min(max(int(np.floor(z + entry * dz)), 0), nz - 1)
-            ix, iy, iz = (1 if dx > 0 else -1), (1 if dy > 0 else -1), (1 if dz > 0 else -1)
+            ix = 1 if dx > 0 else -1
+            iy = 1 if dy > 0 else -1
+            iz = 1 if dz > 0 else -1
             # per axis: distance to the next face that the ray crosses, and between two faces
             tx = (i + (dx > 0) - x) / dx if dx != 0 else np.inf
             ty = (j + (dy > 0) - y) / dy if dy != 0 else np.inf
@@ -262,6 +269,7 @@ def _entry(start, step, size):  # type: ignore[no-untyped-def]
             if not 0 <= start[axis] < size[axis]:
                 return -1.0
             continue
-        one, other = -start[axis] / step[axis], (size[axis] - start[axis]) / step[axis]
+        one = -start[axis] / step[axis]
+        other = (size[axis] - start[axis]) / step[axis]
         near, far = max(near, min(one, other)), min(far, max(one, other))
     return near if near < far else -1.0

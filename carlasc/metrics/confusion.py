@@ -222,7 +222,8 @@ class ConfusionMatrix(Summed):
         """Return precision, recall and IoU of occupied against free space."""
         occupied = np.arange(self.num_classes) != self.free
         hit = self.counts[np.ix_(occupied, occupied)].sum()
-        predicted, true = self.counts[:, occupied].sum(), self.counts[occupied].sum()
+        predicted = self.counts[:, occupied].sum()
+        true = self.counts[occupied].sum()
         return Completeness(*ratio([hit] * 3, [predicted, true, predicted + true - hit]).tolist())
 
 
@@ -234,7 +235,8 @@ def check_free(free: int, num_classes: int) -> None:
 
 def ratio(numerator: Any, denominator: Any) -> FloatArray:
     """Return the quotient; NaN where the denominator is zero."""
-    numerator, denominator = np.asarray(numerator, np.float64), np.asarray(denominator, np.float64)
+    numerator = np.asarray(numerator, np.float64)
+    denominator = np.asarray(denominator, np.float64)
     return np.divide(
         numerator, denominator, out=np.full(denominator.shape, np.nan), where=denominator > 0
     )

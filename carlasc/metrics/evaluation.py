@@ -233,8 +233,10 @@ class Scorer:
         return prediction, truth
 
     def _score(self, pair: Pair, frame: int, content: LabelPair) -> ConfusionMatrix:
-        (prediction, truth, known_by), tables = content, self.tables[pair.truth.path]
-        known, spec = self._known(pair, frame, known_by, truth.shape), pair.spec
+        (prediction, truth, known_by) = content
+        tables = self.tables[pair.truth.path]
+        known = self._known(pair, frame, known_by, truth.shape)
+        spec = pair.spec
         region = None
         if self.scoring.region is not None and spec is not None:
             region = self.scoring.region(spec).reshape(truth.shape)
@@ -262,7 +264,8 @@ class Scorer:
                 if self.rays is not None and (origin := pair.truth.origin) is not None:
                     # Rays begin at the sensor positions of the frames with ground truth, or at that
                     # of this frame if the files have no poses.
-                    poses, row = pair.truth.poses(), pair.truth.frames().tolist().index(frame)
+                    poses = pair.truth.poses()
+                    row = pair.truth.frames().tolist().index(frame)
                     poses, row = (np.eye(4)[None], 0) if poses is None else (poses, row)
                     self.rays.update(pred, true, spec, ray_origins(poses, row, spec, origin))
         except (
@@ -520,7 +523,8 @@ def _score_frames(scorers: Sequence[Scorer], pairs: list[Pair], frames: Frames, 
         for pair, numbers in frames_of
         for first in range(0, len(numbers), size)
     ]
-    step, score = StepCounter(run.progress, total), partial(_score_batch, scorers=scorers)
+    step = StepCounter(run.progress, total)
+    score = partial(_score_batch, scorers=scorers)
     with closing(run_all(score, batches, run, lost=score)) as results:
         for (_, numbers), parts in zip(batches, results, strict=True):
             for scorer, part in zip(scorers, parts, strict=True):

@@ -55,7 +55,9 @@ class FutureGrid(GridFrames):
             )
         self.grid, self.around = grid, around
         self.path, self.location = grid.path, grid.location
-        self.spec, self.classes, self.named = grid.spec, grid.classes, grid.named
+        self.spec = grid.spec
+        self.classes = grid.classes
+        self.named = grid.named
         numbers, sequence = grid.frames(), grid.sequence
         times = sequence.times_of(numbers)
         wanted = times + horizon_s

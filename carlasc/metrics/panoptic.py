@@ -250,11 +250,14 @@ def _match(  # type: ignore[no-untyped-def]
     numbers = {np.int64(-1): np.int64(-1)}  # number of a segment by side and key
     keys = [[np.int64(0) for _ in range(0)] for _ in range(2)]
     sizes = [[np.int64(0) for _ in range(0)] for _ in range(2)]
-    latest, latest_number = np.full((2, _SLOTS), -1, np.int64), np.zeros((2, _SLOTS), np.int64)
+    latest = np.full((2, _SLOTS), -1, np.int64)
+    latest_number = np.zeros((2, _SLOTS), np.int64)
     pairs = {np.int64(-1): np.int64(0)}
-    open_pairs, open_counts = np.full(_SLOTS, -1, np.int64), np.zeros(_SLOTS, np.int64)
+    open_pairs = np.full(_SLOTS, -1, np.int64)
+    open_counts = np.zeros(_SLOTS, np.int64)
     number = np.zeros(2, np.int64)
-    everywhere, all_things = len(may_overlap) == 1, len(is_thing) == 1 and is_thing[0]
+    everywhere = len(may_overlap) == 1
+    all_things = len(is_thing) == 1 and is_thing[0]
     for n in range(len(pred_class)):
         has_pred, has_true = pred_class[n] != free, true_class[n] != free
         if not has_pred and not has_true:
@@ -275,7 +278,8 @@ def _match(  # type: ignore[no-untyped-def]
                     numbers[place] = np.int64(len(keys[side]))
                     keys[side].append(key)
                     sizes[side].append(np.int64(0))
-                latest[side, slot], latest_number[side, slot] = key, numbers[place]
+                latest[side, slot] = key
+                latest_number[side, slot] = numbers[place]
             number[side] = latest_number[side, slot]
             sizes[side][number[side]] += 1
         if has_pred and has_true and (everywhere or may_overlap[n]):

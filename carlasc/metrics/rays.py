@@ -118,7 +118,9 @@ class RayIoU(Summed):
         `directions` are (R, 3) unit vectors of the rays; None takes `rayiou_directions`.
         """
         check_free(free, num_classes)
-        self.num_classes, self.free, self.skip_unknown = num_classes, free, skip_unknown
+        self.num_classes = num_classes
+        self.free = free
+        self.skip_unknown = skip_unknown
         self.directions = (
             rayiou_directions() if directions is None else np.asarray(directions, np.float64)
         )
@@ -154,7 +156,8 @@ class RayIoU(Summed):
             FormatError: shapes differ, or an id is not below `num_classes`.
             ArgumentError: the grid is cylindrical, or `skip_unknown` is set and `known` is missing.
         """
-        pred, true = self._check(prediction, "prediction", spec), self._check(truth, "truth", spec)
+        pred = self._check(prediction, "prediction", spec)
+        true = self._check(truth, "truth", spec)
         further = []
         if self.skip_unknown:
             if known is None:

@@ -427,7 +427,8 @@ def estimate(
         of: what the sum is divided by; empty for the sum itself.
     """
     number = sum(places.values()) or len(summed)
-    values, sizes = np.array(summed), np.array(of or [1 / number] * len(summed))
+    values = np.array(summed)
+    sizes = np.array(of or [1 / number] * len(summed))
     ratio, degrees = values.sum() / (sizes.sum() or math.nan), len(values) - 1
     if not degrees:
         return Interval(ratio, math.nan, math.nan)

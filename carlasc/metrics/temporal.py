@@ -239,7 +239,8 @@ class TrackingQuality(Summed):
         """Return the scores of all added frames; NaN if nothing occurs."""
         sums = dict.fromkeys(self.true, 0.0)
         for (sequence, label, number, other), common in self.common.items():
-            predicted, true = self.predicted[sequence, other], self.true[sequence, label, number]
+            predicted = self.predicted[sequence, other]
+            true = self.true[sequence, label, number]
             if predicted:
                 sums[sequence, label, number] += common * common / (true + predicted - common)
         quality = [total / self.true[key] for key, total in sums.items()]

@@ -149,7 +149,8 @@ class Uncertainty(Summed):
     def compute(self) -> UncertaintyScore:
         """Return the score of all added frames; NaN without voxels."""
         with np.errstate(invalid="ignore"):
-            ece, nll = self.ece[:, 0] / self.ece[:, 1], self.nll[:, 0] / self.nll[:, 1]
+            ece = self.ece[:, 0] / self.ece[:, 1]
+            nll = self.nll[:, 0] / self.nll[:, 1]
         empty, occupied = map(_reliability, self.sums)
         return UncertaintyScore(
             float(ece[0]), float(ece[1]), float(nll[0]), float(nll[1]), empty, occupied

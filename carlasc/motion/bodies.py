@@ -209,7 +209,8 @@ class Sizes:
         if not any(known):  # too few points, or too far away
             return lower, upper
         for axis in (LENGTH, WIDTH):
-            expected, seen = self._expected(label, extent, axis), extent.size[axis]
+            expected = self._expected(label, extent, axis)
+            seen = extent.size[axis]
             missing = max(expected - seen, 0.0)
             if known[axis]:
                 missing *= 1 - _share(seen / _table(extent, axis), _SHORTEST[axis])

@@ -111,9 +111,11 @@ class BoxTable:
                 key = (numbers[number] if numbers else number, frame)
                 if pose is None or velocity is None or (key in rows and frame not in track.members):
                     continue
-                pose, velocity = table_T_world @ pose, rotate_vectors(table_T_world, velocity)
+                pose = table_T_world @ pose
+                velocity = rotate_vectors(table_T_world, velocity)
                 middle = transform_points(pose, (track.lower + track.upper) / 2) * signs
-                ahead, last = pose[:3, 0] * signs, [track.confidence, *track.interval().flat]
+                ahead = pose[:3, 0] * signs
+                last = [track.confidence, *track.interval().flat]
                 heading = [np.arctan2(ahead[1], ahead[0])]
                 own = np.concatenate([middle, track.size, heading, velocity * signs, last])
                 rows[key] = (round(seconds, 6), key[0], names[track.label], *own.round(4))
@@ -211,14 +213,16 @@ class BoxTable:
         check_box_file("boxes_out", path)
         values = [[None if isnan(v) else v for v in row] for row in self.values.T.tolist()]
         own = (self.times.tolist(), self.numbers.tolist(), self.classes, *values)
-        columns, rows = dict(zip(_COLUMNS, own, strict=True)), zip(*own, strict=True)
+        columns = dict(zip(_COLUMNS, own, strict=True))
+        rows = zip(*own, strict=True)
         match path.suffix.lower():
             case ".json":
                 data = to_json([dict(zip(_COLUMNS, row, strict=True)) for row in rows])
             case ".csv":
                 data = csv_text([_COLUMNS, *rows]).encode()
             case _:
-                made, table = io.BytesIO(), import_extra("pyarrow", "parquet").table(columns)
+                made = io.BytesIO()
+                table = import_extra("pyarrow", "parquet").table(columns)
                 import_extra("pyarrow.parquet", "parquet").write_table(table, made)
                 data = made.getvalue()
         write_output(path, data)

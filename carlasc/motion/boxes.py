@@ -267,7 +267,8 @@ def _make_track(
     path, speed = smooth(centers, seconds, boxes.weights, _SMOOTH_S)
     static = _is_static(path, centers, seconds)
     if static:
-        path, speed = np.tile(np.median(centers, axis=0), (len(seconds), 1)), np.zeros_like(speed)
+        path = np.tile(np.median(centers, axis=0), (len(seconds), 1))
+        speed = np.zeros_like(speed)
         turns = np.full(len(seconds), np.median(headings))
     else:
         turns = smooth(headings[:, None], seconds, boxes.weights, _SMOOTH_S)[0][:, 0]
@@ -289,7 +290,8 @@ def _make_track(
             [multiply(rotation_z(angle), tilt) for angle in np.interp(at, seconds, turns)]
         )
         poses[:, :3, 3] = path
-    half, label = np.median(boxes.sizes, axis=0) / 2, int(np.bincount(boxes.labels).argmax())
+    half = np.median(boxes.sizes, axis=0) / 2
+    label = int(np.bincount(boxes.labels).argmax())
     return Track(
         label=label,
         instance=instance,
@@ -328,7 +330,8 @@ def _is_static(path: FloatArray, centers: FloatArray, seconds: FloatArray) -> bo
     duration = float(seconds[-1] - seconds[0])
     if duration <= 0:
         return True
-    line, offsets = centers[:, :2].mean(axis=0), (seconds - seconds.mean())[:, None]
+    line = centers[:, :2].mean(axis=0)
+    offsets = (seconds - seconds.mean())[:, None]
     velocity = (offsets * centers[:, :2]).sum(axis=0) / np.square(offsets).sum()
     length = float(np.hypot(*velocity)) * duration
     deviation = centers[:, :2] - line - offsets * velocity
@@ -376,7 +379,8 @@ def register_boxes(track: Track, segments: Sequence[Segment], times: Mapping[int
     }
     if not (track.moves and track.rigid) or len(hit) < _MIN_OBSERVATIONS:
         return track
-    rows, seconds = np.array([*hit]) - track.first, np.array([times[frame] for frame in hit])
+    rows = np.array([*hit]) - track.first
+    seconds = np.array([times[frame] for frame in hit])
     points = [segment.points for segment in hit.values()]
     poses = track.world_T_actor
     drawn = np.column_stack(

@@ -432,7 +432,9 @@ def _count_around(world: FloatArray, groups: list[IntArray], static: BoolArray) 
     cell = np.floor(world[:, :2] / _CELL_M).astype(np.int64) + (1 << 20)
     key, rows = (cell[:, 0] << 21) | cell[:, 1], np.flatnonzero(static)
     rows = rows[np.argsort(key[rows], kind="stable")]
-    keys, heights, counted = key[rows], world[rows, 2], np.zeros(len(rows), np.int64)
+    keys = key[rows]
+    heights = world[rows, 2]
+    counted = np.zeros(len(rows), np.int64)
     return tuple(
         _count_beside(np.sort(key[group]), world[group, 2], keys, heights, counted, turn)
         for turn, group in enumerate(groups, 1)
@@ -565,7 +567,9 @@ def _by_column(
         if column[i] >= 0:
             members[filled[column[i]]] = i
             filled[column[i]] += 1
-    start, order, count = np.zeros(_COLUMNS + 1, np.int32), np.empty_like(members), 0
+    start = np.zeros(_COLUMNS + 1, np.int32)
+    order = np.empty_like(members)
+    count = 0
     origin = np.zeros((_COLUMNS, 3), np.float32)
     for c in range(_COLUMNS):
         own = members[begin[c] : begin[c + 1]]
@@ -716,7 +720,8 @@ def _look(azimuth, steep, flat, far, start, slope, distance):  # type: ignore[no
     # radians. A slope changes by 1 + slope^2 per radian of elevation: the derivative of tan.
     half = _SIDE_M / flat + _SIDE_RAD
     high = half * (1 + steep * steep)
-    near, beyond = far - _DEPTH_M - _DEPTH_SHARE * far, far + _DEPTH_M + _DEPTH_SHARE * far
+    near = far - _DEPTH_M - _DEPTH_SHARE * far
+    beyond = far + _DEPTH_M + _DEPTH_SHARE * far
     first, middle, last = (
         math.floor((azimuth - half + math.pi) * _PER_RAD),
         math.floor((azimuth + math.pi) * _PER_RAD),

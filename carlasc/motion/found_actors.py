@@ -138,7 +138,9 @@ class ActorFollower:
         self._poses: list[Transform] = []
         self._grounds: list[float] = []
         self._close: list[tuple[int, Int32Array, IntArray]] = []
-        self._deformable, self._label, self._number = deformable, default_label, first_instance
+        self._deformable = deformable
+        self._label = default_label
+        self._number = first_instance
         self._alive: list[_ActorChain] = []
 
     def add(self, scan: FreeSpaceEvidence) -> list[FoundActor]:
@@ -220,7 +222,8 @@ class ActorFollower:
         """Return the cells of the recording vehicle, as a cube: what stays at one place of the
         sensor frame over the whole drive, and is not static.
         """
-        poses, scans = np.array(self._poses).reshape(-1, 4, 4), len(self._poses)
+        poses = np.array(self._poses).reshape(-1, 4, 4)
+        scans = len(self._poses)
         near, freed = (count.reshape((OWN_CELLS,) * 3) for count in (self._near, self._freed))
         steps = np.diff(poses[:, :3, 3], axis=0)
         if np.abs(steps).sum(axis=0).max(initial=0.0) < _SENSOR_PATH_M:
@@ -260,7 +263,9 @@ class _Link:
     @classmethod
     def of(cls, evidence: FreeSpaceEvidence, index: int) -> _Link:
         points = evidence.points[index]
-        pose, freed, around = evidence.world_T_sensor, evidence.freed[index], evidence.around[index]
+        pose = evidence.world_T_sensor
+        freed = evidence.freed[index]
+        around = evidence.around[index]
         members, label = evidence.clusters[index], evidence.labels[index]
         times = evidence.times[index] if evidence.times else None
         segment = Segment(
@@ -324,7 +329,8 @@ class _Link:
             if one.times is None or more.times is None
             else np.concatenate([one.times, more.times]),
         )
-        lower, upper = np.minimum(self.lower, other.lower), np.maximum(self.upper, other.upper)
+        lower = np.minimum(self.lower, other.lower)
+        upper = np.maximum(self.upper, other.upper)
         freed, around = self.freed + other.freed, self.around + other.around
         return replace(self, segment=segment, lower=lower, upper=upper, freed=freed, around=around)
 
@@ -438,7 +444,8 @@ class _ActorChain:
             [(len(link.segment.members), link.freed, link.around) for link in self.links]
         )
         points, freed, around = counts.sum(axis=0).tolist()
-        gain, is_line = 1.0 - best / max(min(shifted), 1e-3), self._is_scan_line()
+        gain = 1.0 - best / max(min(shifted), 1e-3)
+        is_line = self._is_scan_line()
         # who walks along a wall has static neighbours, and aligns at one place only
         aside = 1.0 if is_line else float(np.clip(1.0 - _EXCUSED * gain, 0.0, 1.0))
         support = float(np.log(min(len(self.links), _MANY_OBSERVATIONS) / _OBSERVATIONS))

@@ -109,7 +109,8 @@ def _lowest(
     point of each cell, -1 without one.
     """
     lowest = np.full((_SECTORS, _RINGS), -1, np.int64)
-    sector, ring = np.empty(len(points), np.int32), np.empty(len(points), np.int32)
+    sector = np.empty(len(points), np.int32)
+    ring = np.empty(len(points), np.int32)
     for i in range(len(points)):
         x, y = float(points[i, 0]), float(points[i, 1])
         flat = math.sqrt(x * x + y * y)
@@ -142,7 +143,11 @@ def _plane(
     x, y, z = np.moveaxis(chosen[samples[:, 1:]] - chosen[samples[:, :1]], 2, 0)
     area = x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]  # twice the area of the triangle, square metres
     wide = np.abs(area) > 1.0
-    x, y, z, area, corner = x[wide], y[wide], z[wide], area[wide], chosen[samples[wide, 0]]
+    x = x[wide]
+    y = y[wide]
+    z = z[wide]
+    area = area[wide]
+    corner = chosen[samples[wide, 0]]
     along_x = (z[:, 0] * y[:, 1] - z[:, 1] * y[:, 0]) / area
     along_y = (x[:, 0] * z[:, 1] - x[:, 1] * z[:, 0]) / area
     planes = np.column_stack(
@@ -197,7 +202,9 @@ def _ground(
     for i in range(len(points)):
         s, r = sector[i], ring[i]
         # The median with the neighbours corrects a sector that was followed onto an object.
-        a, b, c = heights[s - 1, r], heights[s, r], heights[(s + 1) % _SECTORS, r]
+        a = heights[s - 1, r]
+        b = heights[s, r]
+        c = heights[(s + 1) % _SECTORS, r]
         middle = max(min(a, b), min(max(a, b), c))
         # The cell of a kerb has the height of the road, and holds points of the pavement too, which
         # has the height of the next ring.

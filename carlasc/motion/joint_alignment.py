@@ -157,7 +157,9 @@ def _choose(normals: FloatArray, thickness: FloatArray) -> IntArray:
     over the scene.
     """
     rows = np.flatnonzero(thickness >= 0)
-    x, y, upright = normals[rows, 0], normals[rows, 1], np.abs(normals[rows, 2])
+    x = normals[rows, 0]
+    y = normals[rows, 1]
+    upright = np.abs(normals[rows, 2])
     # Four quarters of the compass for walls, by which axis is greater and by the sign of x y: a
     # normal and its opposite are in the same quarter. Without limits, ground would outvote walls.
     wall = 2 + 2 * (np.abs(x) > np.abs(y)) + (x * y > 0)
@@ -204,7 +206,9 @@ def clusters(
     while size < 2 * len(points):
         size *= 2
     table = np.full(size, -1, np.int64)
-    keys, sums, count = np.empty(len(points), np.int64), np.zeros((len(points), _SUMS)), 0
+    keys = np.empty(len(points), np.int64)
+    sums = np.zeros((len(points), _SUMS))
+    count = 0
     seen, at = np.empty(3), np.empty(3)
     for i in range(len(points)):
         for a in range(3):
@@ -335,7 +339,9 @@ def add_planes(
         off, weight = to_plane(scan, sums, poses, normals[g], POINT_M * POINT_M + thickness[g])
         slope = np.empty((len(scan), 6))
         for i in range(len(scan)):
-            x, y, z = sums[i, 1] / sums[i, 0], sums[i, 2] / sums[i, 0], sums[i, 3] / sums[i, 0]
+            x = sums[i, 1] / sums[i, 0]
+            y = sums[i, 2] / sums[i, 0]
+            z = sums[i, 3] / sums[i, 0]
             # The derivative of a distance by the step of its pose: the normal, and for the rotation
             # the cross product of the point, from the sensor, and the normal. See `move`.
             slope[i, :3] = normal

@@ -466,7 +466,8 @@ def _solve(
     while loops:
         solved = start.copy()
         for _ in range(3):
-            matrix, right = np.zeros((6 * len(start),) * 2), np.zeros(6 * len(start))
+            matrix = np.zeros((6 * len(start),) * 2)
+            right = np.zeros(6 * len(start))
             matrix[np.arange(6), np.arange(6)] = 1e12  # the first pose stays
             for (i, j, motion), error in [*steps, *((loop[:3], _LOOP) for loop in loops)]:
                 _add(matrix, right, solved, i, j, motion, error)

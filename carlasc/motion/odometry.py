@@ -225,7 +225,8 @@ class _PlaneOdometry:
         away = lengths(used)
         used = used[(away >= self._limits[0]) & (away <= self._limits[1])]
         self._scans.append(_thinned(used, self._voxel_m))
-        before, poses = self.last_pose, [*self._poses, self.last_pose @ self.last_delta]
+        before = self.last_pose
+        poses = [*self._poses, self.last_pose @ self.last_delta]
         start = np.stack(poses)
         aligned = align(self._scans, start, start, len(self._poses), _PASSES, _PRIOR)[-1:]
         # exactly rigid: errors would double with each scan

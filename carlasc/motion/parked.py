@@ -125,7 +125,8 @@ def compare_passes(
             if any(shift):
                 left &= ended <= through
             else:
-                left, stays = (through >= _AGREEING) & (through >= _SURE * ended), ended > through
+                left = (through >= _AGREEING) & (through >= _SURE * ended)
+                stays = ended > through
         held |= stays
         if left.sum() <= _DISAGREEING * (left | stays).sum():
             freed |= left
@@ -166,7 +167,8 @@ def find_gone(keys: IntArray, counts: Int32Array) -> tuple[IntArray, int]:
         lower, upper = cells[own].min(axis=0), cells[own].max(axis=0)
         high = (cells[rows, 2] >= lower[2] - 1) & (cells[rows, 2] <= upper[2])
         standing = len(np.unique(number[own[counts[own, 2] > 0]]))
-        length, size = float(np.hypot(*(upper - lower)[:2])), (upper - lower + 1) * _CELL_M
+        length = float(np.hypot(*(upper - lower)[:2]))
+        size = (upper - lower + 1) * _CELL_M
         if (
             len(own) >= _CELLS
             and standing >= _COLUMNS

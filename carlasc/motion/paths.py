@@ -275,7 +275,9 @@ def headings_of_vehicle(
         return headings_of(velocities)
     known = np.zeros(len(velocities)) if turns is None else turns
     x, y, _ = velocities[fast].T
-    directions, at, weights = np.arctan2(y, x), seconds[fast], np.ones(len(fast))
+    directions = np.arctan2(y, x)
+    at = seconds[fast]
+    weights = np.ones(len(fast))
     # In reverse, a direction differs from the heading by half a turn. It is ahead more often.
     left = np.unwrap(directions - known[fast], period=np.pi)
     speeds = np.hypot(x, y) * np.where(np.cos(directions - known[fast] - left) > 0, 1, -1)

@@ -54,8 +54,10 @@ class Planes:
             joined, known = thin(joined, _POINTS), 0
         elif len(joined) == known:
             return
-        normals, sums = np.zeros((len(joined), 3)), np.zeros((len(joined), _SUMS))
-        normals[:known], sums[:known] = self.normals[:known], self._sums[:known]
+        normals = np.zeros((len(joined), 3))
+        sums = np.zeros((len(joined), _SUMS))
+        normals[:known] = self.normals[:known]
+        sums[:known] = self._sums[:known]
         changed = extend_sums(joined, known, _PLANE_M, sums)
         normals[changed] = _normals(covariances(sums[changed]))
         self.points, self.normals, self._sums = joined, normals, sums
@@ -180,7 +182,9 @@ def nearest_within(
             else:
                 k, after = after, after + 1
                 ahead = model[after, axis] - moved[axis] if after <= last else np.inf
-            x, y, z = moved[0] - model[k, 0], moved[1] - model[k, 1], moved[2] - model[k, 2]
+            x = moved[0] - model[k, 0]
+            y = moved[1] - model[k, 1]
+            z = moved[2] - model[k, 2]
             distance = x * x + y * y + z * z
             if distance < best or (distance == best and order[k] < closest):
                 best, closest = distance, order[k]
@@ -195,7 +199,8 @@ def nearest_points(points: FloatArray, model: FloatArray) -> tuple[IntArray, Flo
     """Return (N,) the index of the model point nearest to each point, and (N,) the squared
     distance, by comparing all pairs.
     """
-    index, squared = np.zeros(len(points), np.int64), np.full(len(points), np.inf)
+    index = np.zeros(len(points), np.int64)
+    squared = np.full(len(points), np.inf)
     for i in range(len(points)):
         for j in range(len(model)):
             dx, dy, dz = (

@@ -208,10 +208,13 @@ def refine_poses(
     fits = np.ones(count, np.bool_)
     done = 0 if begun is None else len(begun.poses)
     if begun is not None:
-        poses[:done], before[:done], after[:done] = begun.poses, begun.before_m, begun.after_m
+        poses[:done] = begun.poses
+        before[:done] = begun.before_m
+        after[:done] = begun.after_m
         refined[:done], fits[:done] = begun.refined, begun.fits
     scans, kept, first = iter(scans), list[ThinnedScan](), 0
-    begin, submaps = 0, Submaps() if loops == "auto" and _may_return(given) else None
+    begin = 0
+    submaps = Submaps() if loops == "auto" and _may_return(given) else None
     while begin < count and count >= MIN_SCANS:
         end = count if count - begin < _STRETCH + HALF_BLOCK else begin + _STRETCH
         start, last = max(0, begin - HALF_BLOCK), min(end + HALF_BLOCK, count)

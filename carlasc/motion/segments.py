@@ -143,7 +143,8 @@ class StaticPoints:
         """Return the static points of a segment's class at its position; None if the segment has
         far more points.
         """
-        lower, upper = segment.points.min(axis=0) - _REST_M, segment.points.max(axis=0) + _REST_M
+        lower = segment.points.min(axis=0) - _REST_M
+        upper = segment.points.max(axis=0) + _REST_M
         own = np.flatnonzero(
             (self.labels == segment.label)
             & ((self.points > lower) & (self.points < upper)).all(axis=1)

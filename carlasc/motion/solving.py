@@ -28,7 +28,9 @@ def least_squares(design: FloatArray, values: FloatArray) -> FloatArray:
     # Gram-Schmidt: invariant of the loop over k is that the first k columns of `basis` are
     # orthonormal or zero, and that design = basis @ upper. Loops, not `@`, add in the order that is
     # written.
-    basis, upper, fit = design.copy(), np.zeros((columns, columns)), np.zeros((columns, wide))
+    basis = design.copy()
+    upper = np.zeros((columns, columns))
+    fit = np.zeros((columns, wide))
     left = values.copy()
     for k in range(columns):
         whole = 0.0
@@ -117,7 +119,8 @@ def principal_axes(
         (N, 3) eigenvalues and (N, 3, 3) unit eigenvectors in columns. The sign of a vector is
         reproducible, but follows no rule.
     """
-    values, vectors = np.empty((len(covariances), 3)), np.empty((len(covariances), 3, 3))
+    values = np.empty((len(covariances), 3))
+    vectors = np.empty((len(covariances), 3, 3))
     for n in range(len(covariances)):
         # Invariant: covariance = v @ a @ v.T. Each turn makes one element off the diagonal zero,
         # and the sum of their squares falls, faster with each sweep (Golub and Van Loan, 8.5).

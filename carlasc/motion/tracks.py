@@ -190,7 +190,8 @@ def make_track(
         velocities = np.stack(
             [segment.velocity for segment in chain if segment.velocity is not None]
         )
-        positions, headings = _integrate(velocities, seconds, chain), headings_of(velocities)
+        positions = _integrate(velocities, seconds, chain)
+        headings = headings_of(velocities)
         if keeps_shape:
             length_m = length_of([segment.points for segment in chain])
             headings, around_axle = (
@@ -383,7 +384,8 @@ def _frames_around(
     frames = np.arange(first - more, last + more + 1)
     inside = np.interp(frames, known, seconds)
     # `np.interp` holds its ends, so the frames beyond them are continued by the mean period.
-    before, after = np.minimum(frames - known[0], 0), np.maximum(frames - known[-1], 0)
+    before = np.minimum(frames - known[0], 0)
+    after = np.maximum(frames - known[-1], 0)
     return frames, inside + (before + after) * period
 
 
@@ -459,7 +461,13 @@ class MovingActors:
 
     def to_bytes(self, key: str, *, is_compressed: bool = True) -> bytes:
         """Return the content of a file with these actors. `key` is a digest of their source."""
-        table, poses, velocities, bounds, members, frames, surfaces = [], [], [], [], [], [], []
+        table = []
+        poses = []
+        velocities = []
+        bounds = []
+        members = []
+        frames = []
+        surfaces = []
         for number, track in self.tracks.items():
             table.append(
                 (
@@ -528,7 +536,9 @@ class MovingActors:
                 int(frame): own
                 for (frame, _), own in zip(arrays["moving_frames"], parts, strict=False)
             }
-            summary, own, seen = tuple(about["summary"]), tuple(arrays["own"]), int(about["seen"])
+            summary = tuple(about["summary"])
+            own = tuple(arrays["own"])
+            seen = int(about["seen"])
             return cls(tracks, moving, summary, own, seen=seen), str(about["key"])
 
 

@@ -408,13 +408,15 @@ class _ShownSequence(PredictedSequence):
         sequence = self.feed.sequence
         if frame not in self.feed.frames:
             return
-        points, pose = sequence.scan(frame, ()).points.astype(np.float64), self.feed.pose(frame)
+        points = sequence.scan(frame, ()).points.astype(np.float64)
+        pose = self.feed.pose(frame)
         for camera in cameras_of(sequence).values():
             place = scan_T_camera(sequence, camera, frame)
             ids = None if place is None else self.pixels.read(camera, frame)
             if place is None or ids is None:
                 continue
-            sure, where = None, f"{sequence.location}: {camera.name}, frame {frame}"
+            sure = None
+            where = f"{sequence.location}: {camera.name}, frame {frame}"
             if ids.ndim == 3:
                 shares = self.reader.probabilities(ids.reshape(-1, ids.shape[2]), where)
                 shares = shares.reshape(ids.shape)

@@ -193,7 +193,8 @@ def points_of_actors(
         (N,) uint32 numbers, 0 for none, and (N, 3) float32 m/s, sensor frame, ego motion removed.
     """
     fields = {"labels", "instances", "seconds"} & feed.sequence.fields()
-    scan, pose = feed.sequence.scan(frame, tuple(sorted(fields))), feed.pose(frame)
+    scan = feed.sequence.scan(frame, tuple(sorted(fields)))
+    pose = feed.pose(frame)
     moving = [track.instance for track in actors.tracks.values()]
     numbers = np.zeros(len(scan), np.uint32)
     if scan.instances is not None:  # points of moving actors get the numbers of tracks

@@ -311,7 +311,8 @@ class PredictionReader:
         rest = np.zeros((len(shares), len(ids)), np.float32)
         for column, target in zip(columns.tolist(), place.reshape(-1).tolist(), strict=True):
             rest[:, target] += shares[:, column]
-        pairs, rows = np.zeros((len(shares), 2 * _PAIRS), np.uint16), np.arange(len(shares))
+        pairs = np.zeros((len(shares), 2 * _PAIRS), np.uint16)
+        rows = np.arange(len(shares))
         for k in range(min(_PAIRS, len(ids))):
             best = rest.argmax(axis=1)
             share = np.rint(np.clip(rest[rows, best], 0, 1) * layout.CERTAIN)

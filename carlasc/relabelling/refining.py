@@ -164,7 +164,8 @@ class _RefinedSequence(DerivedSequence):
         notes = [corrected] if corrected else []
         words = str(whole.metadata.extra.get("poses", _LEFT)).split(", ")
         if estimated:
-            notes, words = [f"poses were estimated from the scans ({_ESTIMATED})"], [_ESTIMATED]
+            notes = [f"poses were estimated from the scans ({_ESTIMATED})"]
+            words = [_ESTIMATED]
         words = [word for word in words if word != _LEFT]
         if _REFINED not in words:
             words.append(_REFINED if self.scans else _LEFT)

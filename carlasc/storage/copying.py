@@ -86,7 +86,8 @@ def copy_blocks(blocks: Series[FrameBlock], run: Run, *, again: bool = False) ->
         block for block in (ours if again else [block.missing() for block in ours]) if block.files
     ]
     total, files = sum(block.files for block in ours), 0
-    step, left = StepCounter(run.progress, total), total - sum(block.files for block in todo)
+    step = StepCounter(run.progress, total)
+    left = total - sum(block.files for block in todo)
     step(left)
     if run.workers is None and run.executor is None:
         run = replace(run, workers=max(1, min(run.processes, len(todo) // _FEW)))
@@ -261,7 +262,8 @@ def unpack(
             found="a folder" if final.is_dir() else "a file",
             advice="choose another name, or give `overwrite=True`",
         )
-    share, sink = Share(source, run), FolderSink(result.out if final is None else unfinished(final))
+    share = Share(source, run)
+    sink = FolderSink(result.out if final is None else unfinished(final))
     write_files(share.sequences(), sink, result, share.run, run.part, again=overwrite)
     if final is not None:
         put_in_place(unfinished(final), final, overwrite=False)

@@ -303,7 +303,8 @@ def check_complete(out: AnyPath, is_complete: bool) -> None:
         CompleteError: it is complete.
     """
     if is_complete:
-        problem, advice = "it is complete, and nothing changed", "`overwrite=True` makes it again"
+        problem = "it is complete, and nothing changed"
+        advice = "`overwrite=True` makes it again"
         raise CompleteError(out, problem=problem, advice=advice)
 
 
@@ -323,7 +324,8 @@ def _check_replaceable(
     if not out.is_dir() or not all(
         is_kind(one.metadata) for one in FolderSource(out).sequences().values()
     ):
-        expected, advice = f"a data set with {kind} to overwrite", "choose another name"
+        expected = f"a data set with {kind} to overwrite"
+        advice = "choose another name"
         raise ConflictError(out, expected=expected, found="something else", advice=advice)
 
 

@@ -220,7 +220,8 @@ class Sequence(ABC):
         """
         if self._given_classes is not None:
             return TableUse(self._given_classes.name, "option")
-        name, table = layout.METADATA, self.classes_of(grid) if grid else self.metadata.classes
+        name = layout.METADATA
+        table = self.classes_of(grid) if grid else self.metadata.classes
         named = bool(grid) and self._record(grid).get("classes") is not None
         if not named and name in self.documents():
             values = parse_json(self.read_document(name), f"{self.location}/{name}")
@@ -445,7 +446,8 @@ class Sequence(ABC):
                 self.frames(f"{name}/labels").tolist()[0],
                 self.classes_of(name).palette,
             )
-            labels, left_handed = self.read(f"{name}/labels", first), self.metadata.axes == "left"
+            labels = self.read(f"{name}/labels", first)
+            left_handed = self.metadata.axes == "left"
             picture = self.grids[name].seen_from_above(labels, palette, left_handed=left_handed)
         return describe(self.location, rows, picture)
 

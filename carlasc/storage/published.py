@@ -63,14 +63,17 @@ class PublishedSource(Source):
         return PublishedSequence(self.tree, path)
 
     def _nothing_found(self) -> MissingDataError:
-        entries, expected = self.tree.entries(), "a sequence or a folder above it"
+        entries = self.tree.entries()
+        expected = "a sequence or a folder above it"
         suffixes = {field.suffix for field in layout.SCAN_FIELDS.values()} | {".label", ".bin"}
         if layout.PARAMS in entries or any(_is_frame(name, suffixes) for name in entries):
-            found, advice = "the files of one field", "give the folder above this one"
+            found = "the files of one field"
+            advice = "give the folder above this one"
         elif stores := sorted(name for name in entries if name.endswith(_CONTAINERS)):
             found, advice = ", ".join(stores[:4]), "give one of these"
         elif entries.get("raw"):
-            found, advice = "a raw capture", "make grids of it first (carlasc regrid)"
+            found = "a raw capture"
+            advice = "make grids of it first (carlasc regrid)"
         else:
             expected = "a data set, a split, a sequence or its cartesian/ or cylindrical/ folder"
             found = f"none of {', '.join(sorted(_marks()))} within four levels of folders"
@@ -155,7 +158,9 @@ class PublishedSequence(Sequence):
 
     def read_many(self, field: str, frames: Iterable[int]) -> list[AnyArray]:
         """Read several files; all at once from a remote tree."""
-        entry, paths, arrays = self._entry(field), list[str](), list[AnyArray]()
+        entry = self._entry(field)
+        paths = list[str]()
+        arrays = list[AnyArray]()
         for frame in frames:  # in Python 3.11, a comprehension is a level of calls
             paths.append(self._prefix + entry.file(frame))
         with_shape = entry.per in ("voxel", "vote", "moving voxel")

@@ -178,7 +178,8 @@ def agree_lines(
     if ours is None:
         return None
     encode, decode = _LINES[document]
-    data, where = writer.read_document(document), f"{writer.location}/{document}"
+    data = writer.read_document(document)
+    where = f"{writer.location}/{document}"
     if data is None:
         return encode(ours)
     existing = decode(data, where)

@@ -18,7 +18,9 @@ class SequenceView(Sequence):
     def __init__(self, whole: Sequence) -> None:
         self.whole = whole
         self.path, self.location = whole.path, whole.location
-        self.split, self.name, self.coordinates = whole.split, whole.name, whole.coordinates
+        self.split = whole.split
+        self.name = whole.name
+        self.coordinates = whole.coordinates
         self._given_poses = whole._given_poses
 
     def fields(self) -> frozenset[str]:

@@ -146,7 +146,8 @@ class VoxelFormat:
         """Yield the grids at a place, each with its name: a folder above the files, a folder of
         some of them, or one file.
         """
-        kind, seen = LabelFrames if self.read is None else VoxelFrames, set[Path]()
+        kind = LabelFrames if self.read is None else VoxelFrames
+        seen = set[Path]()
         for grid, template in self.files.items():
             depth = template.partition("{frame")[2].count("/")
             found: dict[tuple[str, Path], dict[str, Path]] = {}
@@ -177,7 +178,9 @@ class VoxelFrames(GridFrames):
     ) -> None:
         """Keep the files, which are in `folder` or in folders of their frames in it."""
         self.format, self.path, self.location = format, path, str(folder)
-        self.classes, self.named, self.origin = format.classes, format.named, format.origin
+        self.classes = format.classes
+        self.named = format.named
+        self.origin = format.origin
         self.spec = format.spec
         self.files, self.names = files, sorted(files)
 
@@ -355,7 +358,9 @@ class VoxelSequence(Sequence):
 
     def __init__(self, path: str, frames_of: Mapping[str, GridFrames]) -> None:
         first = next(iter(frames_of.values()))
-        self.path, self.location, self.frames_of = path, first.location, frames_of
+        self.path = path
+        self.location = first.location
+        self.frames_of = frames_of
         self.name = path.rpartition("/")[2] or Path(first.location).name
 
     @property
@@ -428,7 +433,8 @@ class VoxelSequence(Sequence):
             return np.zeros(spec.size, np.uint8) if seen is None else seen.astype(np.uint8)
         labels = grid.labels(frame)
         if labels.size != spec.num_voxels:
-            found, expected = str(labels.size), f"{spec.num_voxels} voxels ({spec})"
+            found = str(labels.size)
+            expected = f"{spec.num_voxels} voxels ({spec})"
             raise FormatError(where, expected=expected, found=found)
         labels, table = labels.reshape(spec.size), grid.classes or CARLASC11
         counted = is_counted(labels, table)

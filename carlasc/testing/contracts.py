@@ -90,7 +90,8 @@ class SourceContract:
             for frame, together in zip(
                 frames.tolist(), sequence.read_many(name, frames.tolist()), strict=True
             ):
-                alone, wanted = sequence.read(name, frame), reference.read(name, frame)
+                alone = sequence.read(name, frame)
+                wanted = reference.read(name, frame)
                 assert alone.shape == together.shape == wanted.shape
                 bits = published_bytes(name, wanted)
                 assert published_bytes(name, alone) == bits, (name, frame)
@@ -117,7 +118,9 @@ class SourceContract:
         self, source: Source, expected: dict[str, Sequence]
     ) -> None:
         sequence = source.sequences()[WHOLE]
-        none, some, wanted = sequence.boxes(0), sequence.boxes(5), expected[WHOLE].boxes(5)
+        none = sequence.boxes(0)
+        some = sequence.boxes(5)
+        wanted = expected[WHOLE].boxes(5)
         assert none is not None and len(none) == 0 and sequence.boxes(2) is None
         assert some is not None and wanted is not None and len(some) == 5
         assert some.annotated.dtype == np.bool_ and np.array_equal(some.annotated, wanted.annotated)
@@ -251,7 +254,8 @@ class SinkContract:
                 frames = sequence.frames(name).tolist()
                 assert again.frames(name).tolist() == frames
                 for frame in frames:
-                    got, wanted = again.read(name, frame), sequence.read(name, frame)
+                    got = again.read(name, frame)
+                    wanted = sequence.read(name, frame)
                     same = published_bytes(name, got) == published_bytes(name, wanted)
                     assert same, (path, name, frame)
 

@@ -175,7 +175,8 @@ class ConverterContract:
             pytest.skip("the format does not say what moves")
         frame = self.drive.frames // 2
         truth = self.arrange(frame, [scan.instances for scan in self._scans(frame)])
-        flow, instances = sequence.read("flow", frame), sequence.read("instances", frame)
+        flow = sequence.read("flow", frame)
+        instances = sequence.read("instances", frame)
         speed = np.linalg.norm(flow, axis=1)
         things = [thing for thing in self.drive.things if thing.kind in MOVABLE]
         compared = 0

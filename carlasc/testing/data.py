@@ -65,7 +65,8 @@ def boxes(rng: np.random.Generator, count: int) -> Boxes:
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = rotations, rng.normal(scale=10, size=(count, 3))
     tracks = rng.permutation(1000)[:count].astype(np.uint32) + np.uint32(1)
-    labels, sizes = rng.integers(1, 23, count).astype(np.uint32), rng.uniform(0.3, 5, (count, 3))
+    labels = rng.integers(1, 23, count).astype(np.uint32)
+    sizes = rng.uniform(0.3, 5, (count, 3))
     return Boxes.from_poses(tracks, labels, poses, sizes, rng.random(count) < 0.7)
 
 

@@ -162,7 +162,10 @@ class SimulatedDrive:
         poses[..., 2, 2] = poses[..., 3, 3] = 1.0
         slope = 0.06 * np.cos(0.1 * x)
         cos, sin = 1 / np.hypot(1, slope), slope / np.hypot(1, slope)
-        poses[..., 0, 0], poses[..., 0, 1], poses[..., 1, 0], poses[..., 1, 1] = cos, -sin, sin, cos
+        poses[..., 0, 0] = cos
+        poses[..., 0, 1] = -sin
+        poses[..., 1, 0] = sin
+        poses[..., 1, 1] = cos
         poses[..., 0, 3], poses[..., 1, 3], poses[..., 2, 3] = x, 0.6 * np.sin(0.1 * x), self.axle_m
         return poses
 
@@ -210,7 +213,8 @@ class SimulatedDrive:
         azimuth = np.arange(self.columns) * (2 * np.pi / self.columns) - np.pi
         sweep = (np.arange(self.columns) / self.columns - 0.5) * self.period_s
         turn = (-sweep if self.clockwise else sweep) * self.rolling
-        azimuth, turn = np.repeat(azimuth, self.channels), np.repeat(turn, self.channels)
+        azimuth = np.repeat(azimuth, self.channels)
+        turn = np.repeat(turn, self.channels)
         elevation = np.tile(elevation, self.columns)
         rays = np.stack(
             [
@@ -222,11 +226,15 @@ class SimulatedDrive:
         )
         at = frame * self.period_s + turn
         poses = self.world_T_vehicle(at) @ mount
-        origins, directions = poses[:, :3, 3], np.einsum("nij,nj->ni", poses[:, :3, :3], rays)
+        origins = poses[:, :3, 3]
+        directions = np.einsum("nij,nj->ni", poses[:, :3, :3], rays)
         own = np.broadcast_to(mount[:3, 3], origins.shape), rays @ mount[:3, :3].T
         reach, hit = self._nearest((origins, directions), own, at)
         seen = reach < self.range_m
-        reach, hit, poses, turn = reach[seen], hit[seen], poses[seen], turn[seen]
+        reach = reach[seen]
+        hit = hit[seen]
+        poses = poses[seen]
+        turn = turn[seen]
         if self.noise_m:
             rng = np.random.default_rng([frame, sensor])
             reach = reach + rng.normal(0.0, self.noise_m, len(reach))
@@ -277,10 +285,12 @@ class SimulatedDrive:
             for number, thing in enumerate(self._all, 1):
                 origins, directions = world if number <= len(self.things) else own
                 turn = rotation_z(thing.heading)[:3, :3]
-                start, ray = (origins - thing.place(at)) @ turn, directions @ turn
+                start = (origins - thing.place(at)) @ turn
+                ray = directions @ turn
                 half = np.array(thing.size) / 2
                 one, other = (-half - start) / ray, (half - start) / ray
-                enter, leave = np.fmin(one, other).max(axis=1), np.fmax(one, other).min(axis=1)
+                enter = np.fmin(one, other).max(axis=1)
+                leave = np.fmax(one, other).min(axis=1)
                 nearer = (enter <= leave) & (enter > 0) & (enter < reach)
                 reach[nearer], hit[nearer] = enter[nearer], number
         return reach, hit

@@ -111,9 +111,11 @@ class Scene:
             MissingDataError: a sequence, grid or frame does not exist.
             FormatError: the data do not have the format.
         """
-        part, given = find_sequence(self.source, self.sequence), table_of(self.source_classes)
+        part = find_sequence(self.source, self.sequence)
+        given = table_of(self.source_classes)
         if isinstance(part.sequence, VoxelSequence) and given is not None:
-            part, given = replace(part, sequence=part.sequence.with_classes(given)), None
+            part = replace(part, sequence=part.sequence.with_classes(given))
+            given = None
         truth = None if self.truth is None else find_sequence(self.truth, part.sequence)
         contents = self._default_contents(part) if what is None else self._check_contents(what)
         grid = choose_grid(part, self.grid) if {"grid", "errors"} & set(contents) else ""
@@ -228,7 +230,8 @@ def find_sequence(source: SceneSource, wanted: str | Sequence | None = None) -> 
         if len(sequences) == 1:
             return NamedPart(first)
         path, name, coordinates = wanted.path, wanted.name, wanted.coordinates
-        expected, advice = f"the sequence {name} ({coordinates})", "give the folder of the sequence"
+        expected = f"the sequence {name} ({coordinates})"
+        advice = "give the folder of the sequence"
     else:
         path, name, coordinates = wanted, wanted, None
         expected, advice = f"the sequence {name}", ""

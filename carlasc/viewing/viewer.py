@@ -163,7 +163,8 @@ def view(
         endings = ", ".join((PAGES[0], *RECORDINGS))
         expected = f"a name that ends in {endings}, or without an ending for a folder"
         raise ArgumentError("out", expected=expected, found=out)
-    compared, page = beside is not None or beside_grid is not None, target and not recorded
+    compared = beside is not None or beside_grid is not None
+    page = target and not recorded
     for name, given, fits, expected in (
         ("beside", compared, page, "a page, .html or a folder"),
         ("full_points", full_points, recorded, "a recording, .rrd or .mcap"),

@@ -144,7 +144,8 @@ class Window:
         content = self.reader.read(self.reader.frames[self.position])
         parts, shapes = [ego_vehicle()] if self.reader.shows_ego else [], []
         if self.look < len(content.grids):
-            grid, colors = content.grids[self.look], self.reader.panels[self.look].colors
+            grid = content.grids[self.look]
+            colors = self.reader.panels[self.look].colors
             parts.append(grid_mesh(grid.spec, colors.by_id[grid.labels], grid.labels > 0))
         elif content.scan is not None:
             cloud = self._o3d.geometry.PointCloud(self._vectors(content.scan.points))

@@ -354,7 +354,8 @@ class ScanFeed:
     def free_space(self, plan: GridPlan) -> FreeSpace:
         """Return the maps of free space, which are kept from frame to frame."""
         first, last = self.options.window
-        corners, map_T_world = _corners(plan.spec), invert(self.pose(int(self.frames[0])))
+        corners = _corners(plan.spec)
+        map_T_world = invert(self.pose(int(self.frames[0])))
 
         @cache
         def corners_of(frame: int) -> FloatArray:
@@ -477,7 +478,9 @@ class ScanFeed:
 
     def _segments(self, frame: int, scan: Scan, boxes: Sequence_[Track]) -> list[Segment]:
         """Return the actors of a scan with all their points."""
-        pose, ground, by = self.pose(frame), self.classes.ground, [*self.motion, ""][0]
+        pose = self.pose(frame)
+        ground = self.classes.ground
+        by = [*self.motion, ""][0]
         times, flow = scan.others.get("seconds"), scan.flow
         if times is not None and flow is not None and by in ("flow", "instances"):
             velocity = np.where(is_fast(flow)[:, None], flow, np.float32(0))

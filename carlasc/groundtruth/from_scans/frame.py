@@ -318,7 +318,8 @@ class _FrameSteps:
         return self._returned(slice(None if self.now.frame in self.window else 0))
 
     def _returned(self, chosen: BoolArray | slice) -> tuple[IntArray, Int32Array]:
-        points, now = self.merger.settled(self.now.frame).points[chosen], self.now
+        points = self.merger.settled(self.now.frame).points[chosen]
+        now = self.now
         pose = now.grid_T_world @ self.feed.pose(now.frame)
         counts = count_points(points, [pose], self.plan.spec)
         voxels = np.flatnonzero(counts)
@@ -353,7 +354,8 @@ class _FrameSteps:
         """Return the voxels of bodies with an uncertain decision: free ones that may be occupied,
         and actors that may be free.
         """
-        likely, is_free = self._probability(evidence), self._decide(evidence) == 0
+        likely = self._probability(evidence)
+        is_free = self._decide(evidence) == 0
         unsure = np.where(
             is_free, likely > _DOUBTFUL, (likely < _UNSURE) & (evidence.matter == Matter.BODY)
         )
@@ -496,7 +498,8 @@ class _FrameSteps:
         enough = np.where(is_single, _SINGLE_PER_M, _OUTLIER_PER_M) * self.plan.voting.free_step_m
         is_kept = hits >= enough * free
         kept = lost[is_kept]
-        made.labels[kept], made.counts[kept] = consensus.labels[kept], (hits + free)[is_kept]
+        made.labels[kept] = consensus.labels[kept]
+        made.counts[kept] = (hits + free)[is_kept]
         made.set_probability(kept, _RETURNED_PROBABILITY)
 
     def free_above(self, made: _UnfinishedGrid) -> IntArray:

@@ -66,7 +66,9 @@ class FreeSpace:
         cast_of: Callable[[int, float], Cast],
     ) -> None:
         self.plan = plan
-        self._map_T_world, self._stride, self._cast_of = map_T_world, stride, cast_of
+        self._map_T_world = map_T_world
+        self._stride = stride
+        self._cast_of = cast_of
         # by the frames that share it, and what is in it: an actor has its number
         self._maps = dict[tuple[int, str | int], FreeMap]()
         self._lock = threading.Lock()  # an executor may be of threads
@@ -153,7 +155,10 @@ class FreeMap:
         # a cylindrical voxel is as wide as deep at some radius
         size = (x, x if spec.coordinates == "cylindrical" else y, z)
         parts = [min(max(round(edge / _CELL_M), 2), _MOST) for edge in size]
-        self.spec, self._counted, self._step_m, self._stamp = spec, counted, step_m, 0
+        self.spec = spec
+        self._counted = counted
+        self._step_m = step_m
+        self._stamp = 0
         across = tuple(parts[:2]) if fine else (2, 2)
         self._parts = (1, 1, 1) if counted == "scans" else (*across, parts[2])
         self._cell = np.array(size) / self._parts
@@ -267,7 +272,9 @@ class FreeMap:
         found = np.empty(self.spec.num_voxels if voxels is None else len(voxels), np.uint32)
         cells_T_grid = map_T_grid.copy()
         cells_T_grid[:3] /= self._cell[:, None]
-        pose, cells, volume = as_pose(cells_T_grid), Cells.of(self.spec), float(self._cell.prod())
+        pose = as_pose(cells_T_grid)
+        cells = Cells.of(self.spec)
+        volume = float(self._cell.prod())
         least = 1
         if self._counted == "last":
             least = min((held[3] for held in self._held.values()), default=1)
@@ -307,17 +314,25 @@ def _trace(
     # cell need no exact rule therefore, unlike those of the kernel.
     _, slots, unused, left, counts, stamps = blocks
     # unsigned: Numba need not look for negative indices
-    block_x, block_y, block_z = np.uint64(begin[0]), np.uint64(begin[1]), np.uint64(begin[2])
+    block_x = np.uint64(begin[0])
+    block_y = np.uint64(begin[1])
+    block_z = np.uint64(begin[2])
     bits, places, used = np.uint64(_BITS), np.empty(_MANY, np.uint64), 0
     rays, labels = empty_rays(BLOCK), np.ones(BLOCK, np.uint16)
-    top_x, top_y, top_z = region.size[0] - 1.0, region.size[1] - 1.0, region.size[2] - 1.0
+    top_x = region.size[0] - 1.0
+    top_y = region.size[1] - 1.0
+    top_z = region.size[2] - 1.0
     for place in range(len(ends)):
         view = view_from(pose_of(poses, place), region)
         while ray < ends[place]:
             count = min(BLOCK, ends[place] - ray)
             clip(points[3 * ray : 3 * (ray + count)], labels[:count], step_m, view, rays)
             for i in range(count):
-                x, y, z, step, last = rays.x[i], rays.y[i], rays.z[i], rays.first[i], rays.last[i]
+                x = rays.x[i]
+                y = rays.y[i]
+                z = rays.z[i]
+                step = rays.first[i]
+                last = rays.last[i]
                 dx, dy, dz = rays.dx[i], rays.dy[i], rays.dz[i]
                 if rays.state[i] == DROPPED or last < step:
                     continue
@@ -397,7 +412,9 @@ def _add_column(
     end_x, end_y, end_z = slots.shape
     k = 0
     while k < len(column):
-        x, y, z = start[0] + k * stride[0], start[1] + k * stride[1], start[2] + k * stride[2]
+        x = start[0] + k * stride[0]
+        y = start[1] + k * stride[1]
+        z = start[2] + k * stride[2]
         i, j, low = math.floor(x), math.floor(y), math.floor(z)
         # The next ones are above each other, as long as the axes are almost parallel.
         more = min(_steps(x - i, stride[0]), _steps(y - j, stride[1]))
@@ -408,9 +425,11 @@ def _add_column(
             cell = _in_block(np.uint64(i), np.uint64(j), np.uint64(0))
             begin = max(low, 0)
             while begin < end:
-                slot, above = slots[a, b, begin >> _BITS], min((begin | (_EDGE - 1)) + 1, end)
+                slot = slots[a, b, begin >> _BITS]
+                above = min((begin | (_EDGE - 1)) + 1, end)
                 if slot >= 0:
-                    first, into = cell + np.uint64(begin & (_EDGE - 1)), np.uint64(k + begin - low)
+                    first = cell + np.uint64(begin & (_EDGE - 1))
+                    into = np.uint64(k + begin - low)
                     first += np.uint64(slot * _CELLS)
                     for other in range(np.uint64(above - begin)):
                         value = counts[first + other]
@@ -449,7 +468,9 @@ def _gather(
     stride = pose[2] * rise, pose[6] * rise, pose[10] * rise
     while row < len(found):
         voxel = voxels[row] if len(voxels) else row
-        i, j, k = voxel // (size[1] * size[2]), voxel // size[2] % size[1], voxel % size[2]
+        i = voxel // (size[1] * size[2])
+        j = voxel // size[2] % size[1]
+        k = voxel % size[2]
         height, weight, many = 1, 1.0, along
         while (
             row + height < len(found)
@@ -467,7 +488,8 @@ def _gather(
         for a in range(across):
             u = cells.lower[0] + (i + (a + 0.5) / across) * voxel_size[0]
             for b in range(many):
-                x, y = u, cells.lower[1] + (j + (b + 0.5) / many) * voxel_size[1]
+                x = u
+                y = cells.lower[1] + (j + (b + 0.5) / many) * voxel_size[1]
                 if cells.cylindrical:
                     x, y = u * math.cos(y), u * math.sin(y)
                 x, y, z = transform(pose, x, y, cells.lower[2] + (k + 0.5 / up) * voxel_size[2])

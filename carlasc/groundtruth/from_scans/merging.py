@@ -121,7 +121,9 @@ def passed_by(
             reach = np.sqrt((x - ox) ** 2 + (y - oy) ** 2 + (z - oz) ** 2)
             ux, uy, uz = (x - ox) / reach, (y - oy) / reach, (z - oz) / reach
             for i in range(len(places)):
-                dx, dy, dz = places[i, 0] - ox, places[i, 1] - oy, places[i, 2] - oz
+                dx = places[i, 0] - ox
+                dy = places[i, 1] - oy
+                dz = places[i, 2] - oz
                 along = dx * ux + dy * uy + dz * uz
                 beside = dx * dx + dy * dy + dz * dz - along * along
                 passed[i] |= 0 < along < reach - size_m and beside < size_m * size_m / 16
@@ -255,7 +257,8 @@ class PreparedScan:
         times = np.repeat(seconds, np.diff(self.rays.ends, prepend=0))
         points, ends = self.points.copy(), self.ends.copy()
         for track in tracks:
-            own, velocity = track.members.get(self.frame), track.velocity_at(self.frame)
+            own = track.members.get(self.frame)
+            velocity = track.velocity_at(self.frame)
             if own is not None and velocity is not None:
                 moves = rotate_vectors(invert(self.world_T_sensor), velocity)
                 points[own] = moved_back(points[own], times[own], moves)
@@ -301,7 +304,10 @@ class Merger:
         classes: ClassTable,
         dynamic: Dynamic,
     ) -> None:
-        self.scan_of, self.actors, self.classes, self.dynamic = scan_of, actors, classes, dynamic
+        self.scan_of = scan_of
+        self.actors = actors
+        self.classes = classes
+        self.dynamic = dynamic
         # of each scan, by its frame; then of its points by class, in its own grid or in others, and
         # of what it saw of each actor
         self._static = dict[int, tuple[BoolArray, BoolArray]]()
@@ -376,7 +382,9 @@ class Merger:
             if pose is None or (mirror and not (track.rigid and any(track.extent.known))):
                 continue
             pose = pose @ _MIRROR if mirror else pose
-            casts, points, grid_T_actor = {}, [], as_pose(now.grid_T_world @ pose)
+            casts = {}
+            points = []
+            grid_T_actor = as_pose(now.grid_T_world @ pose)
             for other in window:
                 if mirror or other != now.frame:
                     carried = self._carry(number, other, now)

@@ -432,7 +432,9 @@ class ScanSequence(StoredSequence):
                 scan = feed.sequence.scan(frame, () if feed.must_find_ground else ("labels",))
             except CarlascError:
                 continue
-            points, labels, classes = scan.points, scan.labels, sorted(feed.classes.ground)
+            points = scan.points
+            labels = scan.labels
+            classes = sorted(feed.classes.ground)
             ground = (
                 ground_points(points) if labels is None or not classes else np.isin(labels, classes)
             )

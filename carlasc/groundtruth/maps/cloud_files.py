@@ -215,7 +215,8 @@ def _encode(cells: AnyIntArray, occupied: BoolArray) -> tuple[int, bytes]:
     """Return the number of nodes of a tree, and its encoded bytes."""
     code = _interleave((cells + _MIDDLE).astype(np.uint64))
     order = np.argsort(code)
-    code, state = code[order], np.where(occupied[order], _OCCUPIED, _FREE).astype(np.uint16)
+    code = code[order]
+    state = np.where(occupied[order], _OCCUPIED, _FREE).astype(np.uint16)
     nodes, first, inner = 1, [np.empty(0, np.uint64)], [np.empty(0, np.uint16)]
     depths = [np.empty(0, np.int8)]
     for depth in range(_LEVELS - 1, -1, -1):  # of the parents of these nodes

@@ -201,7 +201,8 @@ class GrowingCells:
         """Return the rows of a tile that are not clearly above the lowest static ones of their
         columns.
         """
-        wide, lowest = max(round(_COLUMN_M / self.cell_m), 1), np.full(_SIDE**2, np.inf)
+        wide = max(round(_COLUMN_M / self.cell_m), 1)
+        lowest = np.full(_SIDE**2, np.inf)
 
         def columns(rows: AnyArray) -> tuple[IntArray, FloatArray]:
             x, y, z = _indices((STATIC, 0, 0), rows["key"] >> _LABEL_BITS).T

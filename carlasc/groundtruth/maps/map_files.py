@@ -149,7 +149,8 @@ class MapFiles:
         for path in self.all:
             is_ours = (path / ACTORS).is_file() if path == self.actors else path.is_file()
             if path.exists() and not (overwrite and is_ours):
-                found, advice = "a file" if path.is_file() else "a folder", "give another name"
+                found = "a file" if path.is_file() else "a folder"
+                advice = "give another name"
                 advice = f"give `overwrite=True`, or {advice[5:]}" if is_ours else advice
                 raise ConflictError(path, expected="nothing", found=found, advice=advice)
         asked = (self.mesh, self.mesh, self.distance, self.ending == ".las")
@@ -213,7 +214,8 @@ class SurfaceMesh:
         Raises:
             DependencyError: scikit-image is not installed.
         """
-        nodes, faces = [np.empty((0, 3), np.int64)], [np.empty((0, 3), np.int64)]
+        nodes = [np.empty((0, 3), np.int64)]
+        faces = [np.empty((0, 3), np.int64)]
         classes, count = [np.empty(0, np.int64)], 0
         occupied = known.labels > 0
         for corner, volume in _blocks(known.index[occupied], known.labels[occupied]):
@@ -261,7 +263,8 @@ def _blocks(cells: IntArray, labels: AnyIntArray) -> Iterator[tuple[IntArray, Ui
         // _BLOCK
     )
     blocks, block = np.unique(owner, axis=0, return_inverse=True)
-    order, row = np.argsort(block.reshape(-1), kind="stable"), np.tile(np.arange(len(cells)), 4)
+    order = np.argsort(block.reshape(-1), kind="stable")
+    row = np.tile(np.arange(len(cells)), 4)
     ends = np.searchsorted(block.reshape(-1)[order], np.arange(len(blocks) + 1))
     for number, (x, y) in enumerate(blocks.tolist()):
         own = np.unique(row[order[ends[number] : ends[number + 1]]])
@@ -308,7 +311,8 @@ def write_distances(path: AnyPath, grid: Grid) -> None:
     """
     transform = import_extra("scipy.ndimage", "mesh").distance_transform_edt
     spec, buffer = grid.spec, io.BytesIO()
-    occupied, size = grid.known & (grid.labels > 0), spec.voxel_size.astype(np.float64)
+    occupied = grid.known & (grid.labels > 0)
+    size = spec.voxel_size.astype(np.float64)
     if occupied.all() or not occupied.any():
         distance = np.full(spec.size, -np.inf if occupied.all() else np.inf)
     else:

@@ -247,7 +247,9 @@ class DriveMap:
 
     def notes(self) -> tuple[str, ...]:
         """Return remarks on the results, one line each."""
-        where, notes, metadata = self.inputs.location, self.inputs.findings(), self.inputs.metadata
+        where = self.inputs.location
+        notes = self.inputs.findings()
+        metadata = self.inputs.metadata
         if self.inputs.feed.has_labels:
             notes.append(f"{where}: classes {self.inputs.sequence.table_use()}")
             if metadata.predicted:
@@ -281,7 +283,8 @@ def _compare_passes(
 
     found = []
     for frame, others in passes.items():
-        scan, views = feed.read(frame), [[view(other) for other in one] for one in others]
+        scan = feed.read(frame)
+        views = [[view(other) for other in one] for one in others]
         compared = merger.static(frame) & ~feed.ground(scan)
         found.append(compare_passes(scan.points, compared, scan.world_T_sensor, views))
     return summed(found)
@@ -308,14 +311,17 @@ class _AddScans:
         actor.
         """
         feed, scan = self.feed, self.feed.read(frame)
-        labels, static, under = merger.labels(frame), merger.static(frame), merger.under(frame)
+        labels = merger.labels(frame)
+        static = merger.static(frame)
+        under = merger.under(frame)
         if feed.must_find_ground:  # ground that was found had a class for the votes only
             labels[feed.classes.have_role(labels, "ground")] = feed.classes.geometry_id
         world = transform_points(scan.world_T_sensor, scan.points.astype(np.float64))
         if len(self.gone):
             inside = np.isin(keys_of(world), self.gone)
             if inside.any():
-                static, under = static & (feed.ground(scan) | ~inside), under | inside
+                static = static & (feed.ground(scan) | ~inside)
+                under = under | inside
         settled = merger.settled(frame).points if self.actors else scan.points
         chosen: list[tuple[int, AnyArray, FloatArray]] = [
             (group, np.flatnonzero(own), world[own])
@@ -359,7 +365,8 @@ def write_grid(source: Source, name: str, frames: FrameRange, files: MapFiles) -
             "grid", expected="a Cartesian grid", found=f"{name}, a {given.spec.coordinates} one"
         )
     grid = mirror_voxels(given) if sequence.metadata.axes == "left" else given
-    lower, size = np.array(grid.spec.lower), grid.spec.voxel_size.astype(np.float64)
+    lower = np.array(grid.spec.lower)
+    size = grid.spec.voxel_size.astype(np.float64)
     index, labels = np.argwhere(grid.known), grid.labels[grid.known]
     occupied = grid.known & (grid.labels > 0)
     if not occupied.any():

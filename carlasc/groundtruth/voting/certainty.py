@@ -296,7 +296,8 @@ def agree(votes: AnyArray, spec: GridSpec, classes: ClassTable) -> ClassConsensu
     if not len(votes):
         return ClassConsensus(labels, np.empty(0, dtype), 0.0)
     counted = np.bincount(votes["label"]) > 0
-    present, own = np.flatnonzero(counted), (np.cumsum(counted) - 1)[votes["label"]]
+    present = np.flatnonzero(counted)
+    own = (np.cumsum(counted) - 1)[votes["label"]]
     begins = np.append(run_starts(votes["voxel"]), len(votes))
     voxels = votes["voxel"][begins[:-1]]
     # dense, so that the compiled loops find a neighbour without a search
@@ -314,7 +315,8 @@ def agree(votes: AnyArray, spec: GridSpec, classes: ClassTable) -> ClassConsensu
     # The majority in voxels with many scans stands for the truth there, instead of the iterations
     # of Dawid and Skene. Classes without such voxels get the usual share of errors, spread evenly
     # over the other classes.
-    confusion, frequency = np.zeros((len(present), len(present))), np.zeros(len(present))
+    confusion = np.zeros((len(present), len(present)))
+    frequency = np.zeros(len(present))
     _compare(cast, confusion, frequency)
     compared = float(confusion.sum())
     wrong = (
@@ -372,7 +374,10 @@ def _compare(cast: _Cast, confusion: FloatArray, frequency: FloatArray) -> None:
     """Count votes in voxels among neighbours of their class: `confusion[a, b]`: votes for b in
     voxels of a. `frequency` counts all voxels.
     """
-    voxels, begins, own, weight = cast.voxels, cast.begins, cast.own, cast.weight
+    voxels = cast.voxels
+    begins = cast.begins
+    own = cast.own
+    weight = cast.weight
     most = np.empty(len(voxels), np.int64)
     for i in range(len(voxels)):
         best = begins[i]
@@ -427,7 +432,9 @@ def _find_shares(
     # Many votes for two classes are of two objects in the voxel, so their confusion is made
     # symmetric.
     many = (few + few.T) / 2
-    doubtful, unsure, scores = np.empty(len(shares), np.int64), 0, np.empty(kinds)
+    doubtful = np.empty(len(shares), np.int64)
+    unsure = 0
+    scores = np.empty(kinds)
     usual = np.log(frequency + _LEAST_PRIOR)
     for i in range(len(cast.voxels)):
         if place[i] >= 0:
@@ -465,7 +472,10 @@ def _posterior(
     """Write the probability of each class of a voxel from its votes and `scores`, the logarithms of
     a prior, which are overwritten.
     """
-    begins, own, weight, total = cast.begins, cast.own, cast.weight, cast.total[i]
+    begins = cast.begins
+    own = cast.own
+    weight = cast.weight
+    total = cast.total[i]
     likely = few if total < _FEW else many
     for row in range(begins[i], begins[i + 1]):
         votes = min(1.0, _ENOUGH_VOTES / total) * weight[row]
@@ -530,7 +540,10 @@ def _mix_shares(
     """Replace the class probabilities of a voxel by the shares of classes that fit its votes: a
     voxel may hold two objects.
     """
-    begins, own, weight, total = cast.begins, cast.own, cast.weight, cast.total[i]
+    begins = cast.begins
+    own = cast.own
+    weight = cast.weight
+    total = cast.total[i]
     # Expectation and maximisation of a mixture: each vote is split among the classes that explain
     # it, and the likeliest classes keep a prior. The start is between both, so that no share of a
     # class with votes is 0: a share of 0 would stay 0.

@@ -144,7 +144,10 @@ def vote_occupied(
     # `entry` is the candidate of the pair (last, label) for which the point before voted, and
     # `more` its votes that are not written yet: neighbouring points are often in one voxel.
     # Arrays are taken out of the tuples once: Numba counts a reference each time.
-    heads, candidates, states, once = tally.heads, tally.candidates, rays.state, tally.once
+    heads = tally.heads
+    candidates = tally.candidates
+    states = rays.state
+    once = tally.once
     entry, last, label, more = 0, NONE, np.uint16(0), 0
     for i in range(len(labels)):
         if states[i] == DROPPED:
@@ -194,7 +197,12 @@ def vote_free(
             vote_free_by_rule(point, pose, view, cells, free_step_m, tally)
         if rays.state[i] != SURE:
             continue
-        x, y, z, dx, dy, dz = rays.x[i], rays.y[i], rays.z[i], rays.dx[i], rays.dy[i], rays.dz[i]
+        x = rays.x[i]
+        y = rays.y[i]
+        z = rays.z[i]
+        dx = rays.dx[i]
+        dy = rays.dy[i]
+        dz = rays.dz[i]
         step, last = rays.first[i], rays.last[i]
         while step <= last:
             # These loops are inline: in a function, Numba would count a reference to the array at

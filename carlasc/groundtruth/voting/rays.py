@@ -74,7 +74,9 @@ def sample_voxel(
     """
     _, ux, uy, uz = unit_ray(x, y, z)
     back = step * free_step_m
-    sx, sy, sz = np.float64(x) - ux * back, np.float64(y) - uy * back, np.float64(z) - uz * back
+    sx = np.float64(x) - ux * back
+    sy = np.float64(y) - uy * back
+    sz = np.float64(z) - uz * back
     if not before_sensor(sx, ux):
         return False, cells.size[0] * cells.size[1] * cells.size[2]
     gx, gy, gz = transform(pose, sx, sy, sz)
@@ -116,8 +118,13 @@ class GridView(NamedTuple):
 @jit
 def view_from(pose: Pose, cells: Cells) -> GridView:
     """Return the view of a grid from a sensor at `pose` (grid_T_sensor)."""
-    lower, upper, voxel, curved = cells.lower, cells.upper, cells.voxel_size, cells.cylindrical
-    nx, ny, nz = float(cells.size[0]), float(cells.size[1]), float(cells.size[2])
+    lower = cells.lower
+    upper = cells.upper
+    voxel = cells.voxel_size
+    curved = cells.cylindrical
+    nx = float(cells.size[0])
+    ny = float(cells.size[1])
+    nz = float(cells.size[2])
     # The published size of a cell is a float32 difference divided by n, so n cells may not end
     # exactly at the upper bound.
     ex, ey, ez = (
@@ -130,11 +137,13 @@ def view_from(pose: Pose, cells: Cells) -> GridView:
         + max(abs(ex - nx), abs(ey - ny), abs(ez - nz))
         + (AZIMUTH_ERROR / voxel[1] if curved else 0.0)
     )
-    low, high = (-MARGIN / 2, -MARGIN / 2), (max(ex, nx) + MARGIN / 2, max(ey, ny) + MARGIN / 2)
+    low = (-MARGIN / 2, -MARGIN / 2)
+    high = (max(ex, nx) + MARGIN / 2, max(ey, ny) + MARGIN / 2)
     sx, sy, sz = 1 / voxel[0], 1 / voxel[1], 1 / voxel[2]
     origin, finest = (lower[0], lower[1]), min(voxel[0], voxel[1], voxel[2])
     if curved:
-        low, high = (-upper[0] - MARGIN, -upper[0] - MARGIN), (upper[0] + MARGIN, upper[0] + MARGIN)
+        low = (-upper[0] - MARGIN, -upper[0] - MARGIN)
+        high = (upper[0] + MARGIN, upper[0] + MARGIN)
         sx, sy, origin, finest = 1.0, 1.0, (0.0, 0.0), min(voxel[0], voxel[2])
     # Rounding may take at most a quarter of the margin. This limits the distance of a point, and
     # its nearness to the axis.
@@ -238,7 +247,9 @@ def clip(
         # The transform of the unit ray minus the position of the sensor is the direction of the
         # ray.
         px, py, pz = transform(view.pose, ux, uy, uz)
-        dx, dy, dz = (px - ox) * free_step_m, (py - oy) * free_step_m, (pz - oz) * free_step_m
+        dx = (px - ox) * free_step_m
+        dy = (py - oy) * free_step_m
+        dz = (pz - oz) * free_step_m
 
         # Samples up to this step are in front of the sensor; this is uncertain for a sample that is
         # almost at the sensor.

@@ -333,7 +333,8 @@ class FrameCounter:
         """Count voxels, and occupied voxels, on the path and on the body of each actor; return the
         occupied voxels of paths.
         """
-        trails, flat = np.zeros(seen.occupied.size, np.bool_), seen.occupied.reshape(-1)
+        trails = np.zeros(seen.occupied.size, np.bool_)
+        flat = seen.occupied.reshape(-1)
         for name, members in self._members(seen):
             own = np.unique(seen.voxels[members])
             own = own[own >= 0]

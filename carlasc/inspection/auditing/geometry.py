@@ -167,10 +167,12 @@ def _sound_or_not(fit: _Fit, where: str) -> Verdict:
     neutral = float(family.values[family.neutral])
     found, unclear = (neutral, neutral, neutral), ""
     if family.kind == "axes":
-        text, others = "those of the scans", np.flatnonzero(shares[1:] >= shares[0] - _ALIKE)
+        text = "those of the scans"
+        others = np.flatnonzero(shares[1:] >= shares[0] - _ALIKE)
         unclear = f"the scene looks the same with {AXES[others[0] + 1][0]}" if len(others) else ""
     elif family.kind == "lag":
-        text, near = "grids fit their own scans best", shares[np.abs(family.values) == 1]
+        text = "grids fit their own scans best"
+        near = shares[np.abs(family.values) == 1]
         is_alike = (near >= shares[family.neutral] - _ALIKE).any()
         unclear = "the vehicle hardly moves" if is_alike else ""
     else:

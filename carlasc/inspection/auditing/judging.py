@@ -225,7 +225,8 @@ class _Judge:
             return
         used = np.flatnonzero(counts.any(axis=(0, 1)) | counts.any(axis=(0, 2)))
         drawn = self.stretches.draw(counts[:, used][:, :, used])
-        names, ground = [_name(table, int(i)) for i in used], np.isin(used, self.one.ground)
+        names = [_name(table, int(i)) for i in used]
+        ground = np.isin(used, self.one.ground)
         rows, right = drawn.sum(axis=2), np.einsum("dkk->dk", drawn)
         kinds = [int(i) for i in np.flatnonzero(rows[0] >= _LEAST)]
         other = {
@@ -268,7 +269,8 @@ class _Judge:
             text = f"{without} of {frames} frames have no mask of known voxels"
             advice = "write the masks of all frames"
             yield self._say("missing masks", True, text, without / frames, advice)
-        counts, kinds = self._confusion, self.stretches.stacked("classes of grids")
+        counts = self._confusion
+        kinds = self.stretches.stacked("classes of grids")
         if not wrong and counts is not None and kinds is not None and self.one.classes is not None:
             met, made_of = counts.sum(axis=(0, 2)) >= _LEAST, kinds.sum(axis=0)
             gone = [
@@ -300,7 +302,8 @@ def _explains(
     voxels of class `i`; otherwise None.
     """
     j = int(drawn[0, i].argmax())
-    own, moved = share_of(right[:, i], rows[:, i]), share_of(drawn[:, i, j], rows[:, i])
+    own = share_of(right[:, i], rows[:, i])
+    moved = share_of(drawn[:, i, j], rows[:, i])
     if j == i or own is None or moved is None:
         return None
     # the ground around a thin marking outvotes it

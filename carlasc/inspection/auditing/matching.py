@@ -171,7 +171,8 @@ class MatchedGrids:
         labels, known = self.grids.labels(frame), self.grids.known(frame)
         where = f"{self.grids.location}: frame {self.grids.name_of(frame)}"
         if labels.size != self.spec.num_voxels:
-            expected, advice = f"{self.spec.num_voxels} voxels", "check the size in params.json"
+            expected = f"{self.spec.num_voxels} voxels"
+            advice = "check the size in params.json"
             raise FormatError(where, expected=expected, found=labels.size, advice=advice)
         labels = labels.reshape(self.spec.size)
         occupied = labels != (0 if self.grids.classes is None else self.grids.classes.free)
@@ -264,7 +265,9 @@ def _recording_of(
 
 
 def _match_frames(grids: GridFrames, scans: Sequence, chosen: FrameRange) -> MatchedGrids:
-    numbers, own, notes = grids.frames().tolist(), scans.frames("points").tolist(), list[str]()
+    numbers = grids.frames().tolist()
+    own = scans.frames("points").tolist()
+    notes = list[str]()
     on_ground = grids.classes == OCC3D
     height = scans.metadata.height_m if on_ground else 0.0
     if height is None:

@@ -115,7 +115,8 @@ def card(
     part = "" if facts.simulated == "all" else f"{facts.simulated} "
     made = say("simulated", part=part) if facts.simulated else ""
     made += say("converted", sources=", ".join(facts.citations)) if facts.citations else ""
-    frames, sequences = count(facts.frames, "LiDAR frame"), count(len(facts.sequences), "sequence")
+    frames = count(facts.frames, "LiDAR frame")
+    sequences = count(len(facts.sequences), "sequence")
     summary = say("summary", frames=frames, sequences=sequences, made=made)
     details = replace(
         about,
@@ -183,7 +184,8 @@ def _draw(facts: Facts, folder: Path, overwrite: bool) -> tuple[list[tuple[Path,
                 continue
             frames = sequence.frames(field)
             frame = int(frames[len(frames) // 2])
-            target, style = folder / PICTURES / f"{what}.png", StyleOptions(size=_SIZE)
+            target = folder / PICTURES / f"{what}.png"
+            style = StyleOptions(size=_SIZE)
             try:
                 scene = Scene(sequence, frames=(frame, frame + 1), grid=grid)
                 result = render(scene, target, what=what, style=style, overwrite=overwrite)

@@ -73,7 +73,8 @@ class CardDetails:
 
     def __post_init__(self) -> None:
         check_types(CardDetails, vars(self))
-        version, address = r"\d+(\.\d+){0,2}([-+][0-9A-Za-z.-]+)?", r"https?://[^\s\"'<>]+"
+        version = r"\d+(\.\d+){0,2}([-+][0-9A-Za-z.-]+)?"
+        address = r"https?://[^\s\"'<>]+"
         try:
             is_date = bool(datetime.date.fromisoformat(self.published or "2000-01-01"))
         except ValueError:

@@ -126,7 +126,9 @@ def _glance(facts: Facts, details: CardDetails) -> str:
 
 
 def _opening(facts: Facts, place: Place, tables: Sequence[PublishedTable]) -> str:
-    name, first, store = place.name or ".", facts.overview.sequences[0], facts.overview.store
+    name = place.name or "."
+    first = facts.overview.sequences[0]
+    store = facts.overview.store
     on_hub = place.repository and place.repository.partition("/datasets/")[2]
     read = f"scan = sequence.scan({first.first})  # points (N, 4), labels (N,)"
     if first.grids:

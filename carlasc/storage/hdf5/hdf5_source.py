@@ -145,7 +145,9 @@ class HDF5Array(StoredArray):
         Raises:
             FormatError: it is not chunked, has other filters, or another number of chunks.
         """
-        where, shape, chunk = f"{tree.where(path)}: {dataset.name}", dataset.shape, dataset.chunks
+        where = f"{tree.where(path)}: {dataset.name}"
+        shape = dataset.shape
+        chunk = dataset.chunks
         if (
             chunk is None
             or _filters(dataset) != [_BLOSC]

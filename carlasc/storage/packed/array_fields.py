@@ -105,7 +105,8 @@ class ArrayField:
         """Read the points of frames as (N, 3), each coordinate contiguous, into the memory of
         `spare` where it fits.
         """
-        packing, column = cast(PointsPacking, self.packing), self.columns.get("xyz")
+        packing = cast(PointsPacking, self.packing)
+        column = self.columns.get("xyz")
         if column is None:
             return [np.empty((0, 3), np.float32) for _ in frames]
         tasks = self._parts(column, frames)

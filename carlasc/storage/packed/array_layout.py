@@ -295,7 +295,8 @@ def index_arrays(
     frames = sorted({frame for table in tables.values() for frame in table})
     columns: dict[str, list[int]] = {}
     for name in sorted(tables):
-        table, firsts = tables[name], {family.name for family in layouts[name].packing.columns}
+        table = tables[name]
+        firsts = {family.name for family in layouts[name].packing.columns}
         for column in layouts[name].columns:
             counts = [table[frame].get(column, 0) if frame in table else -1 for frame in frames]
             if max(counts) > 0 or column in firsts:

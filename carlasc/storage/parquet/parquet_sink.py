@@ -212,7 +212,8 @@ class TableWriter(FieldWriter):
             "field": self.entry.name,
             "unit": self.entry.unit,
         } | describe(self.entry, array, self.scale_m)
-        types, is_picture = column_types(self.entry, self.attributes), self.entry.kind == "picture"
+        types = column_types(self.entry, self.attributes)
+        is_picture = self.entry.kind == "picture"
         self._schema = pa.schema(
             [("sequence", pa.int32()), ("frame", pa.int64())]
             + [(name, getattr(pa, dtype)()) for name, dtype in types.items()]

@@ -113,7 +113,8 @@ def join_columns(
         return join_table(TABLES[entry.kind][attributes["label_bytes"] - 1], columns)
     if len(columns) == 1:
         return narrow(first) if entry.kind == "class" else first
-    rows, scale = np.empty((len(first), len(columns)), entry.dtype), attributes.get("scale_m")
+    rows = np.empty((len(first), len(columns)), entry.dtype)
+    scale = attributes.get("scale_m")
     for k, (name, column) in enumerate(columns.items()):
         rows[:, k] = column * scale if scale and name in AXES else column
     return rows

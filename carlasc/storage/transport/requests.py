@@ -133,7 +133,8 @@ def persist(
             return work()
         except Exception as error:
             arrived = count()
-            attempts, before = (1 if arrived > before else attempts + 1), arrived
+            attempts = 1 if arrived > before else attempts + 1
+            before = arrived
             if attempts >= settings.attempts or not is_temporary(error):
                 raise
             if (stop or threading.Event()).wait(settings.draw_wait_s(attempts)):

@@ -253,7 +253,8 @@ class StoredField:
 
         Its objects must be complete.
         """
-        path, ours = table_path(self.node, block), {f: e.counts for f, e in frames.items()}
+        path = table_path(self.node, block)
+        ours = {f: e.counts for f, e in frames.items()}
         self._tables[block] = ours
         if not self.target.put(path, format_table(ours), create=True):
             while (there := self.table(block)) | ours != there:

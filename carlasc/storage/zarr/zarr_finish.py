@@ -188,7 +188,9 @@ def _write_metadata(target: Target, paths: list[str], incomplete: bool) -> Finis
     if not isinstance(block := root.get("block"), int) or block < 1:
         raise damaged(target.location, "a number of frames in block", repr(block))
     groups, tables = _groups(target, paths), _read_tables(target, paths)
-    result, nodes, sequences = FinishedStore(target.location), StoreNodes(), dict[str, str]()
+    result = FinishedStore(target.location)
+    nodes = StoreNodes()
+    sequences = dict[str, str]()
     for node, attributes in groups.items():
         if attributes.get("type") != SEQUENCE:
             continue

@@ -136,7 +136,8 @@ class FoxgloveWriter:
         if frame.picture is not None:
             log("/picture", "CompressedImage", **ego, data=frame.picture, format="jpeg")
         for photo in frame.photos:
-            topic, own = f"/cameras/{photo.camera.name}", ego | {"frame_id": photo.camera.name}
+            topic = f"/cameras/{photo.camera.name}"
+            own = ego | {"frame_id": photo.camera.name}
             log(f"{topic}/image", "CompressedImage", data=photo.data, format=photo.kind, **own)
             log(f"{topic}/calibration", "CameraCalibration", **own, **_calibration(photo.camera))
         self._output.check()
@@ -181,7 +182,8 @@ class FoxgloveWriter:
         points = np.zeros(len(scan), [*_POINT, ("instance", "<u4")] if numbered else _POINT)
         if numbered:
             points["instance"] = scan.instances
-        points["alpha"], points["label"] = 255, 0 if scan.labels is None else scan.labels
+        points["alpha"] = 255
+        points["label"] = 0 if scan.labels is None else scan.labels
         columns = *scan.points.T, *self._reader.colors.of_points(scan).T
         for name, values in zip((*"xyz", *_RGB), columns, strict=True):
             points[name] = values

@@ -70,7 +70,10 @@ def tight_boxes(scan: Scan) -> Boxes:
     Args:
         scan: with instances; with flow, boxes of moving actors have the right direction.
     """
-    tracks, labels, sizes, poses = list[int](), list[int](), list[Any](), list[Transform]()
+    tracks = list[int]()
+    labels = list[int]()
+    sizes = list[Any]()
+    poses = list[Transform]()
     instances = np.zeros(len(scan), np.uint32) if scan.instances is None else scan.instances
     for actor in np.unique(instances[instances > 0]).tolist():
         members = np.flatnonzero(instances == actor)
@@ -109,7 +112,8 @@ def box_edges(boxes: Boxes) -> QuadMesh:
     bars = []
     for sensor_T_box, size in zip(boxes.sensor_T_box, boxes.sizes, strict=True):
         for start, end in edges_of(size):
-            lower, upper = np.minimum(start, end) - _BAR_M / 2, np.maximum(start, end) + _BAR_M / 2
+            lower = np.minimum(start, end) - _BAR_M / 2
+            upper = np.maximum(start, end) + _BAR_M / 2
             bar = box(lower, upper, palette.ARROW)
             rotation = sensor_T_box[:3, :3]
             bars.append(

@@ -333,7 +333,8 @@ def _fit(
     x, y, z = axes @ points.T
     distances, shifts = [], []
     for across, tangent in ((x, tan_x), (y, tan_y)):
-        above, below = (across - tangent * z).max(), (-across - tangent * z).max()
+        above = (across - tangent * z).max()
+        below = (-across - tangent * z).max()
         distances.append((above + below) / (2 * tangent))
         shifts.append((above - below) / 2)
     return float(max(*distances, _NEAREST_M - z.min())), (float(shifts[0]), float(shifts[1]))

@@ -123,7 +123,8 @@ def grid_drawing(grid: Grid, colors: ClassColors, *, ego: bool = True) -> Drawin
         voxel_colors = np.broadcast_to(layers, (*grid.spec.size, 3))
         legend = palette.height_entries(low, high)
     else:
-        voxel_colors, legend = colors.by_id[grid.labels], colors.entries(ids.tolist())
+        voxel_colors = colors.by_id[grid.labels]
+        legend = colors.entries(ids.tolist())
     return voxel_drawing(grid.spec, voxel_colors, occupied, legend, "no voxel is occupied", ego)
 
 

@@ -85,7 +85,8 @@ def write_pictures(
 
 
 def _write_gif(file: BinaryIO, pictures: Iterator[Uint8Array], fps: float) -> None:
-    first, rest = _to_palette(next(pictures)), (_to_palette(picture) for picture in pictures)
+    first = _to_palette(next(pictures))
+    rest = (_to_palette(picture) for picture in pictures)
     hundredths = max(2, round(100 / fps))  # the unit of the format; viewers slow down below 2
     first.save(
         file,

@@ -71,7 +71,9 @@ def overlay(
         _pictures(reader, model, frames, opacity, (width, height)),
         10.0 if fps is None else fps,
     )
-    took, path, table = time.monotonic() - started, reader.path, reader.table.name
+    took = time.monotonic() - started
+    path = reader.path
+    table = reader.table.name
     size, use = (width, height), reader.table_use
     return RenderResult(
         out, path, ("grid",), frames, len(frames), size, table, took, reader.notes, None, use
@@ -94,11 +96,13 @@ def _pictures(
             reader.data.read_grid(frame),
         )
         if place is None:
-            where, advice = f"{reader.path}: frame {frame}", "choose other frames with `frames`"
+            where = f"{reader.path}: frame {frame}"
+            advice = "choose other frames with `frames`"
             raise MissingDataError(
                 where, expected=f"an image of {camera.name}", found="none", advice=advice
             )
-        picture, labels = read_image(reader.data.sequence, camera, frame), grid.labels.reshape(-1)
+        picture = read_image(reader.data.sequence, camera, frame)
+        labels = grid.labels.reshape(-1)
         first, _ = cast_rays(
             grid.labels[None],
             grid.spec,

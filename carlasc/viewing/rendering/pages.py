@@ -110,7 +110,8 @@ def plan_page(
         else:
             left += gap if column else 0
             right -= gap if column + 1 < columns else 0
-        width, height = max(1, right - left), max(1, bottom - top - title_height)
+        width = max(1, right - left)
+        height = max(1, bottom - top - title_height)
         title, panel = (height, 0) if captions else (0, title_height)
         titles.append(Box(area.x + left, area.y + top + title, right - left, title_height))
         boxes.append(Box(area.x + left, area.y + top + panel, width, height))
@@ -138,7 +139,8 @@ def draw_page(
     for box, picture in zip(page.panels, pictures, strict=True):
         canvas[box.y : box.y + box.height, box.x : box.x + box.width] = picture
     image = import_extra("PIL.Image", "render").fromarray(canvas)
-    draw, font = import_extra("PIL.ImageDraw", "render").Draw(image), font_of(page.font_size)
+    draw = import_extra("PIL.ImageDraw", "render").Draw(image)
+    font = font_of(page.font_size)
 
     def write(box: Box, middle: float, text: str, color: Color) -> None:
         draw.text((box.x + box.width / 2, middle), text, color, font, anchor="mm")

@@ -271,7 +271,8 @@ def plan_cells(renderers: Sequence[FrameRenderer], film: bool) -> list[list[Cell
     if film:
         frames = sorted(set.intersection(*(set(r.reader.frames) for r in renderers)))
         if not frames:
-            where, advice = renderers[0].reader.path, "choose others with `frames`"
+            where = renderers[0].reader.path
+            advice = "choose others with `frames`"
             raise MissingDataError(
                 where, expected="frames that all sources have", found="none", advice=advice
             )

@@ -91,13 +91,17 @@ def _fill(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
                 continue
             sign = 1.0 if volume > 0 else -1.0
             if flat:
-                wa, wb, wc = -depths[0] / volume, -depths[1] / volume, -depths[2] / volume
+                wa = -depths[0] / volume
+                wb = -depths[1] / volume
+                wc = -depths[2] / volume
             else:
                 wa = wb = wc = 1 / volume
             slope = wa * ax + wb * bx + wc * cx
             for row in range(first_y, last_y + 1):
                 y = ys[row]
-                a, b, c = sign * (ay * y + az), sign * (by * y + bz), sign * (cy * y + cz)
+                a = sign * (ay * y + az)
+                b = sign * (by * y + bz)
+                c = sign * (cy * y + cz)
                 base = (wa * ay + wb * by + wc * cy) * y + (wa * az + wb * bz + wc * cz)
                 for column in range(first_x, last_x + 1):
                     x = xs[column]
@@ -105,7 +109,8 @@ def _fill(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
                         continue
                     near = base + slope * x
                     if near >= nearness[row, column] and (not flat or near < 0):
-                        nearness[row, column], seen[row, column] = near, 2 * quad + half
+                        nearness[row, column] = near
+                        seen[row, column] = 2 * quad + half
 
 
 @jit

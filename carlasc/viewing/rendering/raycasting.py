@@ -147,7 +147,8 @@ def _sky_visibility(scene: Any, mesh: QuadMesh) -> Float32Array:
     distribution about its normal.
     """
     number = np.arange(_SKY_RAYS) + 0.5
-    radius, angle = np.sqrt(number / _SKY_RAYS), number * (np.pi * (3 - np.sqrt(5)))
+    radius = np.sqrt(number / _SKY_RAYS)
+    angle = number * (np.pi * (3 - np.sqrt(5)))
     local = np.column_stack(
         [radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - number / _SKY_RAYS)]
     )
