@@ -48,6 +48,9 @@ _STRAIGHT, _MANOEUVRES = 0.35, 0.5
 _MAX_JUMP_M_S = 4.0  # greatest median deviation of the observations' steps from the path's
 _PARTS_M = 1.0  # parts of one vehicle are closer to each other
 _BESIDE_RAD = 0.012  # and no wider gap is between their directions
+# Of a bonnet or a boot, scan lines see nothing but its end: the cabin above it is so far away at
+# most, and begins below its top by so much at most.
+_BONNET_M, _OVERLAP_M = 1.5, 0.1
 # So high things that are not longer are a rider or a person, and no part of something else.
 _WHOLE_M = (1.4, 2.2, 2.4)
 _PERSON_M = (1.5, 2.3)  # actors that are narrower and lower change their shape as they move
@@ -563,7 +566,7 @@ def _join_parts(links: list[_Link], deformable: Collection[int]) -> list[_Link]:
     )
     while i < len(joined):
         gaps = np.maximum(lower[i] - upper[i + 1 :], lower[i + 1 :] - upper[i])
-        near = np.flatnonzero((gaps <= _PARTS_M).all(axis=1)) + i + 1
+        near = np.flatnonzero((gaps <= _BONNET_M).all(axis=1)) + i + 1
         parts = (j for j in near.tolist() if _are_parts(joined[i], joined[j], deformable))
         j = next(parts, None)
         if j is None:
@@ -597,7 +600,10 @@ def _are_parts(one: _Link, other: _Link, deformable: Collection[int]) -> bool:
     seen = [multiply(points[:, :2] - one.segment.origin[:2], directions.T) for points in samples]
     angles = [np.arctan2(y, x) for x, y in (places.T for places in seen)]
     gap = max(a.min() - b.max() for a, b in (angles, angles[::-1]))
-    return bool(gap < _BESIDE_RAD and nearest_points(*samples)[1].min() < _PARTS_M**2)
+    bonnet, cabin = sorted((one, other), key=lambda link: float(link.lower[2]))
+    above = cabin.lower[2] > bonnet.upper[2] - _OVERLAP_M and not cabin.is_small
+    apart_m = _BONNET_M if above else _PARTS_M
+    return bool(gap < _BESIDE_RAD and nearest_points(*samples)[1].min() < apart_m**2)
 
 
 def _link(

@@ -124,7 +124,7 @@ def test_rays_from_many_places_are_followed_from_each(street, tmp_path):
         feed = ScanFeed(sequence, FromScans(window=(-4, 4)))
         window = feed.reaching(20, SPEC)
         grids.append(merge_frame(plan_of(feed), feed, find_actors(feed), 20, window).grid)
-    assert len(feed.read(20).rays) == 17
+    assert len(feed.read(20).rays.ends) == 17
     known = grids[0].known & grids[1].known
     assert known.sum() > 0.97 * grids[0].known.sum()
     assert (grids[0].labels == grids[1].labels)[known].mean() > 0.98
