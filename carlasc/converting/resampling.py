@@ -10,7 +10,8 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.arrays import BoolArray, IntArray, LabelArray, run_starts
+from carlasc.core.arrays import BoolArray, IntArray, LabelArray
+from carlasc.core.cells import run_starts
 from carlasc.core.choices import Axes
 from carlasc.core.grids import GridSpec, mirror_grid, mirror_spec, most_frequent
 

@@ -20,8 +20,3 @@ Uint16Array = NDArray[np.uint16]
 Uint32Array = NDArray[np.uint32]
 BoolArray = NDArray[np.bool_]
 RecordArray = NDArray[np.void]
-
-
-def run_starts(numbers: AnyIntArray) -> IntArray:
-    """Return the first index of each run of equal numbers, which are 0 or more."""
-    return np.flatnonzero(np.diff(numbers, prepend=-1))

@@ -20,6 +20,7 @@ import numpy as np
 
 from carlasc.core.arrays import (
     AnyFloatArray,
+    AnyIntArray,
     BoolArray,
     Float32Array,
     FloatArray,
@@ -144,6 +145,11 @@ def fast_azimuth(x: float, y: float) -> float:
     angle = math.pi / 2 - angle if steep else angle
     angle = math.pi - angle if x < 0.0 else angle
     return -angle if y < 0.0 else angle
+
+
+def run_starts(numbers: AnyIntArray) -> IntArray:
+    """Return the first index of each run of equal numbers, which are 0 or more."""
+    return np.flatnonzero(np.diff(numbers, prepend=-1))
 
 
 def first_of_cells(cells: IntArray) -> BoolArray:

@@ -27,7 +27,6 @@ from carlasc.core.arrays import (
     IntArray,
     LabelArray,
     Uint8Array,
-    run_starts,
 )
 from carlasc.core.choices import Coordinates as Coordinates  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import Preset
@@ -462,7 +461,7 @@ def most_frequent(cells: AnyIntArray, labels: AnyIntArray) -> tuple[IntArray, In
     pairs, counts = np.unique(cells.astype(np.int64) * channels + labels, return_counts=True)
     owners = pairs // channels
     order = np.lexsort((pairs, -counts, owners))
-    best = order[run_starts(owners[order])]
+    best = order[np.flatnonzero(np.diff(owners[order], prepend=-1))]
     return owners[best], pairs[best] % channels
 
 

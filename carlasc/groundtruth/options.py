@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from carlasc.core.choices import Dynamic as Dynamic  # noqa: PLC0414 (part of th
 from carlasc.core.choices import VoteRule as VoteRule  # noqa: PLC0414 (part of this module)
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, check_choice, check_types
+from carlasc.groundtruth.voting.ballot import check_rule
 from carlasc.motion.options import MotionOptions, PoseOptions
 
 if TYPE_CHECKING:
@@ -124,20 +125,6 @@ class FromGrid:
 
 Observe = FromCapture | FromScans | FromGrid
 """The type of the argument `observe` of `regrid`."""
-
-
-def check_rule(rule: str, free_step_m: float) -> None:
-    """Check the rule and the distance of free samples.
-
-    Raises:
-        ArgumentError: an unknown rule, or a distance that is not positive.
-    """
-    if rule not in get_args(VoteRule):
-        raise ArgumentError("rule", expected="sensor, sample or ray", found=repr(rule))
-    if not (math.isfinite(free_step_m) and free_step_m > 0):
-        raise ArgumentError(
-            "free_step_m", expected="a positive number of metres", found=free_step_m
-        )
 
 
 @dataclass(frozen=True)

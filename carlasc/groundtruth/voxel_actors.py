@@ -20,8 +20,8 @@ from carlasc.core.arrays import (
     LabelArray,
     RecordArray,
     Uint32Array,
-    run_starts,
 )
+from carlasc.core.cells import run_starts
 from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.motion.segments import MIN_SPEED_M_S

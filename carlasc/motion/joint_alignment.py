@@ -22,7 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from carlasc.core.arrays import BoolArray, Float32Array, FloatArray, IntArray, run_starts
+from carlasc.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from carlasc.core.cells import run_starts
 from carlasc.core.compiling import cached, jit
 from carlasc.motion.solving import principal_axes, solve_positive
 

@@ -20,9 +20,8 @@ from carlasc.core.arrays import (
     FloatArray,
     Int32Array,
     IntArray,
-    run_starts,
 )
-from carlasc.core.cells import as_pose, distinct, joined, numbered
+from carlasc.core.cells import as_pose, distinct, joined, numbered, run_starts
 from carlasc.core.geometry import (
     Transform,
     invert,

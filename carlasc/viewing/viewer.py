@@ -20,7 +20,7 @@ from typing import BinaryIO, overload
 
 from carlasc.core.classes import TableUse
 from carlasc.errors import ArgumentError, ConflictError, check_types
-from carlasc.running.spreading import Progress, StepCounter
+from carlasc.running.spreading import Progress
 from carlasc.storage.files import (
     AnyPath,
     check_target,
@@ -217,11 +217,11 @@ def _write_recording(
     file: BinaryIO,
 ) -> None:
     writer = _WRITERS[ending](Path(file.name), reader)
-    step = StepCounter(progress, len(reader.frames))
     try:
-        for frame in record_frames(reader, max_points):
+        for done, frame in enumerate(record_frames(reader, max_points), 1):
             writer.write(frame)
-            step()
+            if progress is not None:
+                progress(done, len(reader.frames))
     except BaseException:
         with suppress(OSError):  # the first error is reported
             writer.close()
@@ -274,12 +274,13 @@ def _blocks(
     content: PageContent, scores: list[Scores], progress: Progress | None
 ) -> Iterator[bytes]:
     """Yield each frame as one block of arrays (see `page.contents`), and append its scores."""
-    trails, step = Trails(), StepCounter(progress, len(content.frames))
-    for frame in content.frames:
+    trails = Trails()
+    for done, frame in enumerate(content.frames, 1):
         arrays, own = content.read(frame, trails)
         scores.append(own)
         yield pack_arrays(arrays)
-        step()
+        if progress is not None:
+            progress(done, len(content.frames))
 
 
 def _compose(

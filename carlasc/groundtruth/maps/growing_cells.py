@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, IntArray, LabelArray, run_starts
+from carlasc.core.arrays import AnyArray, Float32Array, FloatArray, IntArray, LabelArray
+from carlasc.core.cells import run_starts
 from carlasc.groundtruth.maps.cloud_files import POINT_DTYPE
 
 Part = tuple[int, int, int]

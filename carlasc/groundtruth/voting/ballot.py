@@ -8,9 +8,10 @@ and a voxel without votes is unknown: see the format page, `docs/format.md#votes
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 
@@ -29,8 +30,7 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, check_rigid
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA
-from carlasc.errors import FormatError
-from carlasc.groundtruth.options import check_rule
+from carlasc.errors import ArgumentError, FormatError
 from carlasc.groundtruth.voting import filled, kernel
 from carlasc.storage.field_files import VOTES_DTYPE, votes_dtype
 
@@ -163,6 +163,20 @@ def count_votes(
     for observation in observations:
         ballot.add(observation)
     return ballot.votes(copy=False)
+
+
+def check_rule(rule: str, free_step_m: float) -> None:
+    """Check the rule and the distance of free samples.
+
+    Raises:
+        ArgumentError: an unknown rule, or a distance that is not positive.
+    """
+    if rule not in get_args(VoteRule):
+        raise ArgumentError("rule", expected="sensor, sample or ray", found=repr(rule))
+    if not (math.isfinite(free_step_m) and free_step_m > 0):
+        raise ArgumentError(
+            "free_step_m", expected="a positive number of metres", found=free_step_m
+        )
 
 
 class Ballot:

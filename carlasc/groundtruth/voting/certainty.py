@@ -39,8 +39,8 @@ from carlasc.core.arrays import (
     IntArray,
     LabelArray,
     Uint16Array,
-    run_starts,
 )
+from carlasc.core.cells import run_starts
 from carlasc.core.classes import ClassTable
 from carlasc.core.compiling import cached, inlined, jit
 from carlasc.core.grids import GridSpec
