@@ -142,8 +142,8 @@ def unpack_again(root: Path, attempt: Attempt) -> None:
 
 
 def export_again(root: Path, attempt: Attempt) -> None:
-    """Export a data set to each of the formats."""
-    for name in exporter_names():
+    """Export a data set to each of the formats, but for one that is written beside a recording."""
+    for name in set(exporter_names()) - {"ncore"}:
         with tempfile.TemporaryDirectory(dir=root.parent) as out:
             attempt(lambda name=name, out=out: carlasc.export(name, root, out, run=Run(workers=1)))
 
