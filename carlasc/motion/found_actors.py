@@ -601,13 +601,12 @@ def _are_parts(one: _Link, other: _Link, deformable: Collection[int]) -> bool:
     angles = [np.arctan2(y, x) for x, y in (places.T for places in seen)]
     gap = max(a.min() - b.max() for a, b in (angles, angles[::-1]))
     # Nor does one between a bonnet and the cabin above it, which is not wider.
-    low, high = sorted((0, 1), key=lambda k: float((one, other)[k].lower[2]))
-    bonnet, cabin = (one, other)[low], (one, other)[high]
-    above = cabin.lower[2] > bonnet.upper[2] - _OVERLAP_M and not cabin.is_small
-    left = angles[low].min() - angles[high].min()
-    right = angles[high].max() - angles[low].max()
-    above &= max(left, right) < _BESIDE_RAD
-    apart_m = _BONNET_M if above else _PARTS_M
+    (bonnet, below), (cabin, over) = sorted(
+        zip((one, other), angles, strict=True), key=lambda part: float(part[0].lower[2])
+    )
+    wider = max(below.min() - over.min(), over.max() - below.max())
+    above = cabin.lower[2] > bonnet.upper[2] - _OVERLAP_M and wider < _BESIDE_RAD
+    apart_m = _BONNET_M if above and not cabin.is_small else _PARTS_M
     return bool(gap < _BESIDE_RAD and nearest_points(*samples)[1].min() < apart_m**2)
 
 

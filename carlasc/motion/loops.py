@@ -288,8 +288,7 @@ def _lay(submaps: Sequence[Submap], first: int, second: int) -> Iterator[Loop]:
     possible = np.hypot(off[0], off[1]) < window and abs(off[2]) < height
     held = values[0, 0] > _DETERMINED * values.sum()
     near = _matches(one.planes, other.planes, motion, _SAME_M)
-    smooth = len(near[0]) and _apart(one.planes, other.planes, motion, *near) < _ROUGH_M
-    if alone and possible and held and smooth:
+    if alone and possible and held and _apart(one.planes, other.planes, motion, *near) < _ROUGH_M:
         yield Loop(first, second, motion, float(values[0, 0]))
 
 
