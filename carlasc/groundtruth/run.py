@@ -622,7 +622,8 @@ class SequenceJob:
         must be made, because they lack a file or their inputs changed.
         """
         missing = self.missing()
-        self.check.look(self.numbers - missing, self._agrees, run)
+        begun = {n for n in missing if any(self.writer.has(name, n) for name in self.check.copied)}
+        self.check.look(self.numbers - missing, begun, self._agrees, run)
         return missing | self.check.stale
 
     def _agrees(self, number: int) -> bool | None:
