@@ -51,7 +51,8 @@ class TargetFrame:
         (x0, y0, z0) = right.lower
         (x1, y1, z1) = right.upper
         (nx, ny, nz) = right.size
-        z0, z1 = z0 + self.height_m, z1 + self.height_m
+        z0 = z0 + self.height_m
+        z1 = z1 + self.height_m
         if self.forward == "x":
             return GridSpec("cartesian", (nx, ny, nz), (x0, y0, z0), (x1, y1, z1))
         return GridSpec("cartesian", (ny, nx, nz), (-y1, x0, z0), (-y0, x1, z1))
@@ -63,7 +64,8 @@ class TargetFrame:
         (x0, y0, z0) = spec.lower
         (x1, y1, z1) = spec.upper
         (nx, ny, nz) = spec.size
-        z0, z1 = z0 - self.height_m, z1 - self.height_m
+        z0 = z0 - self.height_m
+        z1 = z1 - self.height_m
         if self.forward == "x":
             right = GridSpec("cartesian", (nx, ny, nz), (x0, y0, z0), (x1, y1, z1))
         else:

@@ -345,9 +345,11 @@ class StoredSequence(SequenceInput):
     """A sequence of the layout. Its scans, poses, times and frame numbers are kept."""
 
     def __init__(self, sequence: Sequence, plan: GridPlan) -> None:
-        self.sequence, self.plan = sequence, plan
+        self.sequence = sequence
+        self.plan = plan
         self.path = layout.place_of(sequence.path)
-        self.location, self.metadata = sequence.location, sequence.metadata
+        self.location = sequence.location
+        self.metadata = sequence.metadata
 
     def files(self) -> FrameFiles | None:
         """Return the files of the scans."""
@@ -427,7 +429,8 @@ class InputCheck:
                 cannot be made.
             run: how the reading of files is spread.
         """
-        inputs, files = self.inputs, self.inputs.files()
+        inputs = self.inputs
+        files = self.inputs.files()
         record = self._record = MadeFrom.read(self.writer, self._name)
         kept = self.compare == "never" and existing and not self.is_provisional
         if files is None or kept:
@@ -514,7 +517,8 @@ class InputCheck:
         """
         if not self._whole:
             return
-        record, writer = self._record, self.writer
+        record = self._record
+        writer = self.writer
         is_copy = os.path.realpath(writer.location) != os.path.realpath(self.inputs.location)
         if self.gone:
             written = [f"{self.grid}/{part}" for part in layout.GRID_FIELDS]
@@ -537,7 +541,8 @@ class InputCheck:
 
     def _remove_others(self) -> None:
         """Remove from a copy the lines, text files and fields that the input has no longer."""
-        inputs, writer = self.inputs, self.writer
+        inputs = self.inputs
+        writer = self.writer
         of_frames = {layout.POSES: inputs.poses(), layout.TIMES: inputs.times()}
         for name, lines in of_frames.items():
             if self.gone and (left := agree_lines(writer, name, lines, is_whole=True)):

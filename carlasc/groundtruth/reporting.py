@@ -25,10 +25,8 @@ from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.inputs import digest_of, digest_of_bytes
 
 # of one observation: points that are used, and points whose distance is measured
-_MOST_POINTS, _MOST_ASKED = (
-    600,
-    50,
-)
+_MOST_POINTS = 600
+_MOST_ASKED = 50
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,8 @@ class Residual:
             world_T_actor: (4, 4) pose of the actor at the first observation.
             world_T_next: (4, 4) its pose at the next one.
         """
-        one, other = thin(one, _MOST_POINTS), thin(other, _MOST_POINTS)
+        one = thin(one, _MOST_POINTS)
+        other = thin(other, _MOST_POINTS)
         static = _distances(one, other)
         moving = _distances(
             transform_points(invert(world_T_actor), one),
@@ -286,13 +285,12 @@ class FrameFacts:
         if counts is not None:
             seen = np.asarray(counts).reshape(-1)
             known = seen > 0
-            labels, seen = labels[known], seen[known]
+            labels = labels[known]
+            seen = seen[known]
             # the exponents of float32: several times faster than `frexp`
             powers = np.clip((seen.astype(np.float32).view(np.int32) >> 23) - 127, 0, POWERS - 1)
-            votes, votes_sum = (
-                np.bincount(powers, minlength=POWERS),
-                float(seen.sum(dtype=np.float64)),
-            )
+            votes = np.bincount(powers, minlength=POWERS)
+            votes_sum = float(seen.sum(dtype=np.float64))
         # counting a label of 2**32 - 1 would take 32 GB
         classes.check(labels, f"{grid}: frame {frame}")
         by_class = np.bincount(labels, minlength=classes.num_channels)
@@ -547,9 +545,11 @@ class Report:
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain values for JSON."""
-        values, own = asdict(self), f"{self.grid}/"
+        values = asdict(self)
+        own = f"{self.grid}/"
         digests = values.pop("digests").items()
-        coverage, convergence = self.coverage, self.convergence
+        coverage = self.coverage
+        convergence = self.convergence
         shares = "known_share", "occupied_share"
         values["coverage"] |= {name: getattr(coverage, name) for name in shares}
         if convergence is not None:
@@ -642,7 +642,8 @@ def _coverage(rows: list[FrameFacts], settings: Mapping[str, Any], classes: Clas
 
 
 def _digests(rows: list[FrameFacts], name: str) -> Digests:
-    whole, frames = blake2b(digest_size=16), []
+    whole = blake2b(digest_size=16)
+    frames = []
     for row in rows:
         digest = row.digests.get(name)
         frames.append(_ABSENT if digest is None else short(digest))

@@ -119,7 +119,9 @@ def see_voxels(
 @cached
 def _mark_seen(voxels, eye, solid, bit, seen):  # type: ignore[no-untyped-def]
     """Set a bit of the voxels that rays from an eye reach. Everything is in units of voxels."""
-    size, boxes, middle = solid.size, solid.boxes, np.empty(3)
+    size = solid.size
+    boxes = solid.boxes
+    middle = np.empty(3)
     for voxel in voxels:
         cell = voxel // (size[2] * size[1]), (voxel // size[2]) % size[1], voxel % size[2]
         reached = _reaches((cell[0] + 0.5, cell[1] + 0.5, cell[2] + 0.5), eye, cell, solid)
@@ -175,7 +177,9 @@ def _reach_points(points, eye, solid, reached):  # type: ignore[no-untyped-def]
             at_x = points[n, 0]
             at_y = points[n, 1]
             at_z = points[n, 2] + raised
-            ray_x, ray_y, ray_z = eye[0] - at_x, eye[1] - at_y, eye[2] - at_z
+            ray_x = eye[0] - at_x
+            ray_y = eye[1] - at_y
+            ray_z = eye[2] - at_z
             far = max(abs(ray_x), abs(ray_y), abs(ray_z))
             # from this share of the ray on, voxels hide the point
             first = 1.0 if far <= _BESIDE else _BESIDE / far
@@ -205,11 +209,9 @@ def _reaches(at, eye, cell, solid):  # type: ignore[no-untyped-def]
     """Return whether no obstacle lies between a position in a voxel and the eye."""
     size, (x, y, z) = solid.size, cell
     ray = ray_x, ray_y, ray_z = eye[0] - at[0], eye[1] - at[1], eye[2] - at[2]
-    step_x, step_y, step_z = (
-        (1 if ray_x > 0 else -1),
-        (1 if ray_y > 0 else -1),
-        (1 if ray_z > 0 else -1),
-    )
+    step_x = 1 if ray_x > 0 else -1
+    step_y = 1 if ray_y > 0 else -1
+    step_z = 1 if ray_z > 0 else -1
     each_x = abs(1.0 / ray_x) if ray_x != 0 else np.inf
     each_y = abs(1.0 / ray_y) if ray_y != 0 else np.inf
     each_z = abs(1.0 / ray_z) if ray_z != 0 else np.inf
@@ -252,13 +254,16 @@ def _is_stopped(at, ray, cell, voxel, solid):  # type: ignore[no-untyped-def]
     """Return whether an occupied voxel, or the box around its points if they are known, stops a ray
     through the voxel.
     """
-    boxes, first, last = solid.boxes, 0.0, 1.0
+    boxes = solid.boxes
+    first = 0.0
+    last = 1.0
     if not len(boxes) or boxes[voxel, 0] > boxes[voxel, 3]:
         return True
     for axis in range(3):
         low = cell[axis] + boxes[voxel, axis] / STEPS - solid.beyond[axis] - at[axis]
         high = cell[axis] + (1.0 + boxes[voxel, 3 + axis]) / STEPS + solid.beyond[axis] - at[axis]
-        enter, leave = low / ray[axis], high / ray[axis]
+        enter = low / ray[axis]
+        leave = high / ray[axis]
         first = max(first, min(enter, leave))
         last = min(last, max(enter, leave))
     return first < last

@@ -44,7 +44,8 @@ _ASSUMED_M = (  # fact: argoverse2-lidar
 )
 _INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px")
 _NEAR_NS = 100_000_000  # an image that is farther from a frame in time does not belong to it
-_QUATERNION, _TRANSLATION = ("qw", "qx", "qy", "qz"), ("tx_m", "ty_m", "tz_m")
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_TRANSLATION = ("tx_m", "ty_m", "tz_m")
 _SIZE = ("length_m", "width_m", "height_m")
 
 
@@ -93,7 +94,9 @@ class Argoverse2Log(Recording):
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.name, self.location = folder, f"AV2_{folder.name}", str(folder)
+        self.folder = folder
+        self.name = f"AV2_{folder.name}"
+        self.location = str(folder)
         self.split = _SPLITS.get(folder.parent.name, "Train")
 
     @cached_property
@@ -339,7 +342,8 @@ class Sweep(FrameHandle):
         """Read the points of each LiDAR, in the order of the file."""
         names = ("x", "y", "z", "intensity", "laser_number", "offset_ns")
         table = read_columns(Path(self.location), names)
-        count, lasers = len(table["x"]), table["laser_number"]
+        count = len(table["x"])
+        lasers = table["laser_number"]
         if not count:
             raise FormatError(
                 self.location, expected="points", found="an empty table", advice="download it again"

@@ -109,9 +109,12 @@ class BagRecording(Recording):
     split = "Train"
 
     def __init__(self, files: BagFiles, options: BagOptions) -> None:
-        self._files, self._options, self.location = files, options, files.location
+        self._files = files
+        self._options = options
+        self.location = files.location
         self.name = sequence_name(files.paths[0].name.split(".")[0].removesuffix("_0"))
-        self._pose_note, self._notes = "", list[str]()
+        self._pose_note = ""
+        self._notes = list[str]()
         self._lidars = [
             LidarTopic(topic, options.time_unit, deskewed=options.deskewed)
             for topic in files.clouds(options.topics)
@@ -146,7 +149,8 @@ class BagRecording(Recording):
             MissingDataError: there are several, and no transforms between them.
             FormatError: the points of one are in the frame of the world.
         """
-        tree, sensors = self._tree, list[Sensor]()
+        tree = self._tree
+        sensors = list[Sensor]()
         for lidar, motion in zip(self._lidars, self._motions, strict=True):
             if not tree.connected(lidar.frame, self._vehicle):
                 raise self._no_path(lidar.frame, self._vehicle, "convert one LiDAR with `topics`")
@@ -162,7 +166,8 @@ class BagRecording(Recording):
         Raises:
             FormatError: its frame does not belong to the vehicle.
         """
-        tree, motions = self._tree, list[tuple[IntArray, FloatArray] | None]()
+        tree = self._tree
+        motions = list[tuple[IntArray, FloatArray] | None]()
         for frame in (lidar.frame for lidar in self._lidars):
             known = tree.connected(frame, self._vehicle)
             stamps = tree.motion(self._vehicle, frame) if known else None
@@ -241,7 +246,8 @@ class BagRecording(Recording):
         """Return the cameras that transforms place on the vehicle, with the image nearest to each
         frame.
         """
-        cameras, stamps = list[CameraModel](), self._lidars[0].stamps
+        cameras = list[CameraModel]()
+        stamps = self._lidars[0].stamps
         for camera in self._cameras.values():
             if not self._tree.connected(camera.frame, self._vehicle):
                 note = (
@@ -360,7 +366,10 @@ class BagRecording(Recording):
 
         Of a topic of paths, the last message is read, which holds the whole path.
         """
-        places, errors, bad, good = list(topic.places()), list[FormatError](), list[str](), 0
+        places = list(topic.places())
+        errors = list[FormatError]()
+        bad = list[str]()
+        good = 0
         for place in places[-1:] if topic.channel.type == PATH else places:
             try:
                 placed = read_placed(place.read(), place.channel, str(place))
@@ -387,7 +396,8 @@ class BagRecording(Recording):
         """Return times and poses of the vehicle in the world; None if the vehicle does not move in
         the tree.
         """
-        line, wanted = self._tree.ancestors(self._vehicle), self._options.world_frame
+        line = self._tree.ancestors(self._vehicle)
+        wanted = self._options.world_frame
         world = next(
             (name for name in ((wanted,) if wanted else (*_WORLDS, line[-1])) if name in line), None
         )

@@ -43,7 +43,8 @@ from carlasc_converters.ply import PlyVertices
 
 # the simulation runs at 10 frames per second, and the set's own loader gives frame i the time 0.1 i
 _PERIOD_S = 0.1  # fact: carlaocc-period
-_SCANS, _PROPERTIES = "semantic_lidar", ("x", "y", "z", "ObjIdx", "ObjTag")
+_SCANS = "semantic_lidar"
+_PROPERTIES = ("x", "y", "z", "ObjIdx", "ObjTag")
 
 
 class CarlaOcc(Converter):
@@ -122,7 +123,9 @@ class CarlaOccRecording(Recording):
     sensors = (Sensor("lidar", height_m=1.73),)
 
     def __init__(self, folder: Path, split: Split, grid: str | None) -> None:
-        self.folder, self.split, self.location = folder, split, str(folder)
+        self.folder = folder
+        self.split = split
+        self.location = str(folder)
         self.name = sequence_name(folder)
         self.grid = grid if grid is not None and (folder / "occupancy" / grid).is_dir() else None
 
@@ -242,7 +245,8 @@ class CarlaOccFrame(FrameHandle):
         """
         if self.grid is None:
             return None
-        spec, expected = read_geometry(self.grid), read_geometry(self.reference)
+        spec = read_geometry(self.grid)
+        expected = read_geometry(self.reference)
         if spec != expected:
             raise FormatError(
                 self.grid,

@@ -28,11 +28,13 @@ class CarlaOccGrids(GridFrames):
         grid: name of the folder in `occupancy/`.
     """
 
-    classes, named = CARLAOCC, "format"
+    classes = CARLAOCC
+    named = "format"
     origin = (0.0, 0.0, 0.0)
 
     def __init__(self, folder: Path, grid: str) -> None:
-        self.path, self.location = sequence_name(folder), str(folder / "occupancy" / grid)
+        self.path = sequence_name(folder)
+        self.location = str(folder / "occupancy" / grid)
         self.files = {
             int(file.stem): file
             for file in Path(self.location).glob("[0-9]*.npz")
@@ -109,7 +111,8 @@ def read_voxels(path: str | Path, spec: GridSpec) -> tuple[Uint8Array, BoolArray
             path, expected=f"voxels inside of {spec}", found=f"{outside} voxels outside"
         )
     semantic = semantic_ids(rows[:, 3])
-    labels, known = np.zeros(spec.size, np.uint8), np.ones(spec.size, np.bool_)
+    labels = np.zeros(spec.size, np.uint8)
+    known = np.ones(spec.size, np.bool_)
     labels[tuple(cells.T)] = semantic
     known[tuple(cells[semantic == 0].T)] = False
     return labels, known
@@ -122,10 +125,8 @@ def semantic_ids(codes: LabelArray) -> Uint8Array:
     instance`. Most voxels belong to classes whose instance is always 0, and no label above 0 is a
     multiple of both numbers, so the formula can be determined from the labels.
     """
-    decimal, binary = (
-        int(np.count_nonzero(codes % 1000 == 0)),
-        int(np.count_nonzero(codes % 2048 == 0)),
-    )
+    decimal = int(np.count_nonzero(codes % 1000 == 0))
+    binary = int(np.count_nonzero(codes % 2048 == 0))
     return (codes // (1000 if decimal > binary else 2048)).astype(np.uint8)
 
 
@@ -146,7 +147,8 @@ def read_geometry(path: str | Path) -> GridSpec:
         check_size((x, y, z), np.dtype(np.uint8), str(path))
         # Rounded to decimals first, because the origin is float32 and the voxel size is not: the
         # bounds are then those of the documentation in float32, as with `--bounds`.
-        low, up = np.round(lower, 4).tolist(), np.round(lower + cells * float(step), 4).tolist()
+        low = np.round(lower, 4).tolist()
+        up = np.round(lower + cells * float(step), 4).tolist()
         return GridSpec(
             "cartesian", (x, y, z), (low[0], low[1], low[2]), (up[0], up[1], up[2])
         ).with_bounds(low, up)

@@ -39,7 +39,8 @@ from carlasc_converters.kitti_files import (
 )
 from carlasc_converters.kitti_voxels import GRID, read_voxel_files
 
-_TEST_FIRST, _VALIDATION = 11, 8
+_TEST_FIRST = 11
+_VALIDATION = 8
 
 
 class SemanticKitti(KittiConverter):
@@ -79,7 +80,9 @@ class KittiRecording(Recording):
     sensors = (Sensor("velodyne", height_m=HEIGHT_M),)
 
     def __init__(self, folder: Path, name: str, split: Split) -> None:
-        self.folder, self.name, self.split = folder, name, split
+        self.folder = folder
+        self.name = name
+        self.split = split
         self.location = str(folder)
         self.has_labels = self.has_instances = bool(frames_of(folder / "labels", ".label"))
         self.voxels = GRID if frames_of(folder / "voxels", ".label") else None

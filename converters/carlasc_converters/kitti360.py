@@ -118,7 +118,8 @@ class Kitti360Drive(Recording):
     sensors = (Sensor("velodyne", deskewed=False),)
 
     def __init__(self, files: Kitti360Files) -> None:
-        self.files, self.location = files, str(files.scans.parent)
+        self.files = files
+        self.location = str(files.scans.parent)
         self.name = (
             f"KITTI360_{files.drive.removeprefix('2013_05_28_drive_').removesuffix('_sync')}"
         )
@@ -324,7 +325,8 @@ def _read_poses(path: Path) -> tuple[IntArray, FloatArray]:
 
 
 def _imu_T_lidar(folder: Path, force: bool) -> Transform:
-    to_pose, to_lidar = folder / "calib_cam_to_pose.txt", folder / "calib_cam_to_velo.txt"
+    to_pose = folder / "calib_cam_to_pose.txt"
+    to_lidar = folder / "calib_cam_to_velo.txt"
     if force and not (to_pose.is_file() and to_lidar.is_file()):
         return np.eye(4)
     purpose = "the place of the LiDAR on the car: poses.txt holds poses of the IMU"

@@ -159,10 +159,8 @@ class Calibration:
         """Return the same for KITTI's raw data, whose files have a rotation `R` and a translation
         `T`.
         """
-        rotation, place = (
-            np.reshape(self._numbers(9, "R"), (3, 3)),
-            np.reshape(self._numbers(3, "T"), (3, 1)),
-        )
+        rotation = np.reshape(self._numbers(9, "R"), (3, 3))
+        place = np.reshape(self._numbers(3, "T"), (3, 1))
         return self._rigid(np.hstack([rotation, place]), "R, T")
 
     def _numbers(self, count: int, *names: str) -> list[float]:
@@ -251,7 +249,8 @@ class FrameTimes:
                 found=found,
                 advice=_AGAIN,
             )
-        numbers, stamps = numbers[known], stamps[known]
+        numbers = numbers[known]
+        stamps = stamps[known]
         seconds = cls(stamps[0], np.empty(0)).of(stamps)
         if not (np.diff(seconds) > 0).all():
             found = f"none at frame {numbers[int(np.argmin(np.diff(seconds))) + 1]}"

@@ -82,7 +82,8 @@ class RawDrive(Recording):
     sensors = (Sensor("velodyne", deskewed=False, height_m=HEIGHT_M),)
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.location = folder, str(folder)
+        self.folder = folder
+        self.location = str(folder)
         match = _DRIVE.fullmatch(folder.name)
         self.name = f"KITTI_{match[1]}_{match[2]}" if match else f"KITTI_{folder.name}"
 

@@ -95,7 +95,10 @@ class TrackingSequence(Recording):
     sensors = (Sensor("velodyne", deskewed=False, height_m=HEIGHT_M),)
 
     def __init__(self, folder: Path, number: str, name: str, split: Split) -> None:
-        self.folder, self.number, self.name, self.split = folder, number, name, split
+        self.folder = folder
+        self.number = number
+        self.name = name
+        self.split = split
         self.location = str(folder / "velodyne" / number)
 
     @cached_property
@@ -122,7 +125,8 @@ class TrackingSequence(Recording):
         path = self._file("oxts")
         if not path.is_file():
             return None
-        packets, last = read_packets(path), self._numbers[-1]
+        packets = read_packets(path)
+        last = self._numbers[-1]
         by_order = len(packets) == len(self._numbers) <= last
         if len(packets) <= last and not by_order:
             raise FormatError(
@@ -192,7 +196,8 @@ class TrackingSequence(Recording):
             if row[2] == _IGNORED:
                 continue
             try:
-                frame, track = int(row[0]), int(row[1])
+                frame = int(row[0])
+                track = int(row[1])
                 height, width, length, x, y, z, turn = map(float, row[10:_COLUMNS])
             except ValueError as error:
                 raise FormatError(where, expected="numbers but in column 3", found=error) from error
@@ -241,7 +246,8 @@ def _camera_T_box(center: FloatArray, turn_rad: float) -> Transform:
     """Return the pose of a box in the camera's frame (x right, y down, z forward), from its
     rotation about y.
     """
-    forward, up = np.array([np.cos(turn_rad), 0.0, -np.sin(turn_rad)]), np.array([0.0, -1.0, 0.0])
+    forward = np.array([np.cos(turn_rad), 0.0, -np.sin(turn_rad)])
+    up = np.array([0.0, -1.0, 0.0])
     pose = np.eye(4)
     pose[:3, :3] = np.stack([forward, np.cross(up, forward), up], axis=1)
     pose[:3, 3] = center

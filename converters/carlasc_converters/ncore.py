@@ -28,7 +28,8 @@ from carlasc_converters.transforms import FrameTree, PlacedFrame
 _VERSION = "v4"
 _COMPONENT = "v1"
 _KINDS = ("lidars", "poses", "cuboids", "cameras", "intrinsics")
-_RIG, _WORLD = "rig", "world"
+_RIG = "rig"
+_WORLD = "world"
 _NS = 1000  # nanoseconds in a microsecond
 _ALONE_US = 50_000.0  # greatest distance in time from a single frame to the data that belong to it
 
@@ -88,7 +89,9 @@ class NcoreRecording(Recording):
     split = "Train"
 
     def __init__(self, name: str, stores: Sequence[NcoreStore]) -> None:
-        self.name, self.location, self._stores = sequence_name(name), str(stores[0].path), stores
+        self.name = sequence_name(name)
+        self.location = str(stores[0].path)
+        self._stores = stores
         if not self._lidars:
             raise MissingDataError(
                 self.location,
@@ -200,7 +203,8 @@ class NcoreRecording(Recording):
                     edges[source].append(
                         (target, stamps, np.array([invert(pose) for pose in poses]))
                     )
-        tree, reached = FrameTree(self.location), list[str]()
+        tree = FrameTree(self.location)
+        reached = list[str]()
         waiting = [_WORLD if _WORLD in edges else _RIG]
         while waiting:
             parent = waiting.pop()
@@ -229,7 +233,8 @@ class NcoreRecording(Recording):
         Raises:
             MissingDataError: there are several, and no poses between them.
         """
-        at, sensors = self._first[:1, 1] * _NS, []
+        at = self._first[:1, 1] * _NS
+        sensors = []
         for name in self._lidars:
             if not self._tree.connected(name, self.vehicle):
                 raise MissingDataError(
@@ -284,7 +289,8 @@ class NcoreRecording(Recording):
         annotated = sorted({frame for frame, _ in self._observations} - {-1})
         numbers: dict[str, int] = {}
         where = f"{self.location}: cuboids"
-        rows, seen = BoxRows(where, annotated), set[tuple[int, int]]()
+        rows = BoxRows(where, annotated)
+        seen = set[tuple[int, int]]()
         with opening(where, "observations of tracks"):
             for frame, entry in self._observations:
                 track = numbers.setdefault(entry["track_id"], len(numbers) + 1)
@@ -298,7 +304,8 @@ class NcoreRecording(Recording):
                     * _NS
                 )
                 vehicle_T_reference = self._between(entry["reference_frame_id"], stamps)
-                box, label = entry["bbox3"], class_of_name(entry["class_id"])
+                box = entry["bbox3"]
+                label = class_of_name(entry["class_id"])
                 pose = multiply(vehicle_T_reference, _pose_of(box["centroid"], box["rot"]))
                 size = np.array(box["dim"], np.float64)
                 rows.add(frame, track, OTHER_OBJECT if label is None else label, pose, size)
@@ -310,7 +317,8 @@ class NcoreRecording(Recording):
         if (component := self._component("intrinsics")) is None:
             return []
         store, group = component
-        images, cameras = self._components["cameras"], []
+        images = self._components["cameras"]
+        cameras = []
         for name in store.groups(f"{group}/cameras"):
             own, place = images.get(name, (store, f"cameras/{name}"))
             cameras.append(
@@ -328,7 +336,8 @@ class NcoreRecording(Recording):
 
     def cameras(self) -> Sequence[CameraModel]:
         """Return the cameras with a model of the layout and with poses that lead to the vehicle."""
-        models, at = [], self._first[:1, 1] * _NS
+        models = []
+        at = self._first[:1, 1] * _NS
         for camera in self._cameras:
             if camera.unknown is None and self._tree.connected(camera.name, self.vehicle):
                 middles = self._seconds(camera.spans.mean(axis=1))
@@ -358,7 +367,8 @@ class NcoreRecording(Recording):
             if camera.unknown or not self._tree.connected(camera.name, self.vehicle)
         ]
         for kind in ("poses", "cuboids", "intrinsics"):
-            chosen, groups = self._component(kind), self._components[kind]
+            chosen = self._component(kind)
+            groups = self._components[kind]
             if others := [name for name, component in groups.items() if component != chosen]:
                 notes.append(f"several {kind}: only one was read, not {', '.join(others)}")
         if idle := sorted(self._components["lidars"].keys() - self._lidars.keys()):
@@ -393,10 +403,8 @@ class NcoreRecording(Recording):
                 found=self._tree,
             )
         root = self._tree.ancestors(self.vehicle)[-1]
-        now, then = (
-            self._tree.lookup(root, self.vehicle, stamps[:1])[0],
-            self._tree.lookup(root, reference, stamps[1:])[0],
-        )
+        now = self._tree.lookup(root, self.vehicle, stamps[:1])[0]
+        then = self._tree.lookup(root, reference, stamps[1:])[0]
         return multiply(invert(now), then)
 
 
@@ -450,12 +458,15 @@ class NcoreFrame(FrameHandle):
 
 def _pose_of(centroid: Sequence[float], angles_rad: Sequence[float]) -> Transform:
     """Return (4, 4) of a box: turned about the fixed axes x, y and z, in this order."""
-    pose, turn = np.eye(4), np.eye(3)
+    pose = np.eye(4)
+    turn = np.eye(3)
     for axis, angle in enumerate(angles_rad):
         one, (a, b) = np.eye(3), [k for k in range(3) if k != axis]
         sign = -1 if axis == 1 else 1
         one[a, a] = one[b, b] = np.cos(angle)
-        one[a, b], one[b, a] = -sign * np.sin(angle), sign * np.sin(angle)
+        one[a, b] = -sign * np.sin(angle)
+        one[b, a] = sign * np.sin(angle)
         turn = one @ turn
-    pose[:3, :3], pose[:3, 3] = turn, centroid
+    pose[:3, :3] = turn
+    pose[:3, 3] = centroid
     return pose

@@ -45,10 +45,8 @@ class NcoreCamera:
     @property
     def unknown(self) -> str | None:
         """Why its images cannot be projected; None if they can."""
-        kind, given = (
-            self.lens.get("camera_model_type"),
-            self.lens.get("camera_model_parameters", {}),
-        )
+        kind = self.lens.get("camera_model_type")
+        given = self.lens.get("camera_model_parameters", {})
         if kind not in ("opencv-pinhole", "opencv-fisheye"):
             return f"the model {kind}"
         if self.lens.get("external_distortion_type") or given.get("external_distortion_parameters"):

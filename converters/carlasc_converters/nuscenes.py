@@ -53,7 +53,8 @@ class NuScenes(Converter):
         ] = True,
     ) -> None:
         super().__init__(source)
-        self.version, self.sweeps = version, sweeps
+        self.version = version
+        self.sweeps = sweeps
 
     def sequences(self) -> list[Recording]:
         """Return the scenes with files, by name. This reads the tables.
@@ -65,7 +66,8 @@ class NuScenes(Converter):
         """
         tables = Tables(self._version())
         tables.check_categories()
-        root, names = tables.folder.parent, _Names()
+        root = tables.folder.parent
+        names = _Names()
         recordings: list[Recording] = []
         for scene in tables.scenes:
             present = {
@@ -87,7 +89,8 @@ class NuScenes(Converter):
 
     def _version(self) -> Path:
         """Return the folder of the tables."""
-        root, asked = self.source.resolve(), self.version
+        root = self.source.resolve()
+        asked = self.version
         if (root / "scene.json").is_file() and asked in (None, root.name):
             return root
         folders = sorted(path.parent for path in root.glob("v*/scene.json"))
@@ -143,20 +146,24 @@ class NuScenesScene(Recording):
             present: files of points that exist.
             all_scans: whether scans between key frames are frames, too.
         """
-        self.tables, self.scene = tables, scene
-        self.name, self.location = f"NUSC_{scene.name}", f"{tables.folder}: {scene.name}"
+        self.tables = tables
+        self.scene = scene
+        self.name = f"NUSC_{scene.name}"
+        self.location = f"{tables.folder}: {scene.name}"
         self.split = _split_of(scene.name, tables.folder.name)
         self._between = any(scan.sample < 0 and scan.file in present for scan in scene.scans)
         self._asked_for_all = all_scans
         chosen = [scan for scan in scene.scans if scan.sample >= 0 or (all_scans and self._between)]
-        self._scans, self._present = chosen, present
+        self._scans = chosen
+        self._present = present
         self.has_labels = any(scan.labels or scan.instances for scan in chosen)
         self.has_instances = any(scan.instances for scan in chosen)
 
     @cached_property
     def frames(self) -> Sequence[FrameHandle]:  # type: ignore[override]
         """The scans that exist."""
-        root, boxes = self.tables.folder.parent, self._boxes
+        root = self.tables.folder.parent
+        boxes = self._boxes
         sensor_T_vehicle = invert(self.sensors[0].vehicle_T_sensor)
         return [
             NuScenesFrame(
@@ -219,16 +226,15 @@ class NuScenesScene(Recording):
 
     def cameras(self) -> Sequence[CameraModel]:
         """Return the cameras of the scene, with the images nearest in time to each frame."""
-        root, models = self.tables.folder.parent, []
+        root = self.tables.folder.parent
+        models = []
         frames = np.array([scan.timestamp for scan in self._scans], np.int64)
         for token in sorted(
             {image.mount for image in self.scene.images},
             key=lambda one: self.tables.cameras[one].channel,
         ):
-            row, own = (
-                self.tables.cameras[token],
-                [image for image in self.scene.images if image.mount == token],
-            )
+            row = self.tables.cameras[token]
+            own = [image for image in self.scene.images if image.mount == token]
             nearest, near, images = nearest_images(
                 {image.timestamp: root / image.file for image in own}, frames, _NEAR_US
             )
@@ -281,7 +287,8 @@ class NuScenesScene(Recording):
 
     def problems(self) -> list[tuple[int, str]]:
         """Return the scans that the tables list and that have no file."""
-        root, advice = self.tables.folder.parent, "unpack the archives of the sensor data again"
+        root = self.tables.folder.parent
+        advice = "unpack the archives of the sensor data again"
         missing = [
             (number, scan.file)
             for number, scan in enumerate(self._scans)

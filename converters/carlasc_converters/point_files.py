@@ -73,7 +73,8 @@ def _read_bin(path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray
             found=len(data),
             advice=f"check `columns` ({','.join(columns)})",
         )
-    width, sample = len(columns), values[:_VALUES]
+    width = len(columns)
+    sample = values[:_VALUES]
     unlike = {
         number: _unlikeness(sample.reshape(-1, number))
         for number in {width, *range(3, _MOST_COLUMNS + 1)}

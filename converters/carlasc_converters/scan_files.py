@@ -91,10 +91,12 @@ class ScanFile(FrameHandle):
                 expected=f"the fields of the first scan ({', '.join(self.fields)})",
                 found=", ".join(fields),
             )
-        points, seconds = fields["points"], None
+        points = fields["points"]
+        seconds = None
         if self.clock is not None:
             seconds = self.clock.seconds(columns, returns(columns), self.stamp, path)
-        labels, instances = fields.get("label"), fields.get("instance")
+        labels = fields.get("label")
+        instances = fields.get("instance")
         if self.labels is not None and index == 0:
             labels = read_labels(Path(self.labels), len(points))
         if not self.options.has_classes:

@@ -76,10 +76,8 @@ _HEIGHT_M = (
     1.8  # height of the origin of a frame above its ground: about that of the LiDAR in CarlaSC
 )
 # around the middle of a tile, and least number of ground points there
-_GROUND_RADIUS_M, _GROUND_POINTS = (
-    5.0,
-    20,
-)
+_GROUND_RADIUS_M = 5.0
+_GROUND_POINTS = 20
 _BATCH = 1 << 18  # rows in memory
 # x and y from the middle of the tile
 _ROW = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f8"), ("label", "u1")])
@@ -109,7 +107,8 @@ class SynthCity(Converter):
         ] = "coarse",
     ) -> None:
         super().__init__(source)
-        self.columns, self.grid = columns, grid
+        self.columns = columns
+        self.grid = grid
 
     def sequences(self) -> list[Recording]:
         """Return the areas, by name.
@@ -153,7 +152,9 @@ class SynthCityArea(Recording):
     sensors = (Sensor("assumed", height_m=_HEIGHT_M),)
 
     def __init__(self, path: Path, columns: Mapping[str, str], voxels: GridSpec) -> None:
-        self.path, self.location, self.columns = path, str(path), columns
+        self.path = path
+        self.location = str(path)
+        self.columns = columns
         self.voxels = self._spec = voxels
         self.name = f"SYNTHCITY_{path.stem.replace('_', '-')}"
 
@@ -180,7 +181,8 @@ class SynthCityArea(Recording):
 
         One pass over the table makes them.
         """
-        folder, tiles = _TileFolder(), set[tuple[int, int]]()
+        folder = _TileFolder()
+        tiles = set[tuple[int, int]]()
         for points, labels in _batches(self.path, self.columns):
             tiles |= _append(folder.name, points, labels, self._step)
         if not tiles:
@@ -254,7 +256,9 @@ class SynthCityFrame(FrameHandle):
         """Read the points of the tile, at all heights."""
         rows = np.fromfile(self.rows, _ROW)
         points = np.zeros((len(rows), 4), np.float32)
-        points[:, 0], points[:, 1], points[:, 2] = rows["x"], rows["y"], rows["z"] - self.height_m
+        points[:, 0] = rows["x"]
+        points[:, 1] = rows["y"]
+        points[:, 2] = rows["z"] - self.height_m
         return (Cloud(points, rows["label"]),)
 
     def read_voxels(self) -> VoxelContent:
@@ -264,7 +268,8 @@ class SynthCityFrame(FrameHandle):
         (cloud,) = self.read()
         assert cloud.labels is not None
         cells = self.spec.flat_index(cloud.points[:, :3])
-        inside, kinds = cells >= 0, len(CLASSES.names)
+        inside = cells >= 0
+        kinds = len(CLASSES.names)
         votes = np.bincount(
             cells[inside] * kinds + cloud.labels[inside], minlength=self.spec.num_voxels * kinds
         )
@@ -327,7 +332,8 @@ def _batches(path: Path, columns: Mapping[str, str]) -> Iterator[tuple[FloatArra
                 row = done + int(np.argmax(wrong))
                 raise FormatError(path, expected="finite coordinates", found=f"others in row {row}")
             if (wrong := ~np.isin(labels, np.arange(len(CLASSES.names) - 1))).any():
-                value, count = labels[np.argmax(wrong)], int(wrong.sum())
+                value = labels[np.argmax(wrong)]
+                count = int(wrong.sum())
                 raise FormatError(
                     path,
                     expected=f"labels 0 to {len(CLASSES.names) - 2} in the column "
@@ -359,13 +365,15 @@ def _append(
     tiles = np.floor(points[:, :2] / step).astype(np.int64)
     rows = np.empty(len(points), _ROW)
     rows["x"], rows["y"] = (points[:, :2] - (tiles + 0.5) * step).T
-    rows["z"], rows["label"] = points[:, 2], labels
+    rows["z"] = points[:, 2]
+    rows["label"] = labels
     low = tiles.min(axis=0)
     codes = (tiles[:, 0] - low[0]) * (np.ptp(tiles[:, 1]) + 1) + (tiles[:, 1] - low[1])
     # 16 bits, in nearly all cases, are sorted ten times as fast as 64
     codes = codes.astype(np.min_scalar_type(codes.max()))
     order = np.argsort(codes, kind="stable")
-    rows, codes = rows[order], codes[order]
+    rows = rows[order]
+    codes = codes[order]
     starts = np.append(0, np.flatnonzero(np.diff(codes)) + 1)
     squares = [(int(x), int(y)) for x, y in tiles[order[starts]]]
     try:

@@ -160,7 +160,8 @@ class _Columns:
 
 def kitti_poses(folder: Path, names: list[str]) -> FloatArray | None:
     """Return (F, 4, 4) poses of the LiDAR from the poses.txt and calib.txt above the voxels."""
-    poses, calibration = folder.parent / "poses.txt", folder.parent / "calib.txt"
+    poses = folder.parent / "poses.txt"
+    calibration = folder.parent / "calib.txt"
     if not (poses.is_file() and calibration.is_file()):
         return None
     with reading(poses, "a pose of 12 numbers for each scan, and Tr in calib.txt"):
@@ -204,7 +205,8 @@ class CarlaScPredictions(VoxelFormat):
             for path, names in matches(place, template):
                 found.setdefault(path.parent, {})[names["frame"]] = path
             for folder, files in sorted(found.items()):
-                coordinates, scans = folder.parent.name, layout.scan_folders()
+                coordinates = folder.parent.name
+                scans = layout.scan_folders()
                 if coordinates not in layout.COORDINATES or folder.name in scans:
                     continue
                 for preset in ("coarse", "fine", "cylindrical"):

@@ -44,7 +44,8 @@ class NcoreExporter(BoxExporter):
         frames, notes = self.read(sequence)
         recording, numbers, rig_T_scan = Origin.of(sequence, Ncore, self.recording)
         assert isinstance(recording, NcoreRecording)
-        names, observations = sequence.metadata.classes.names, []
+        names = sequence.metadata.classes.names
+        observations = []
         for frame in frames:
             boxes = frame.boxes.transform(rig_T_scan)
             stamp = int(recording.ends_us[numbers[frame.number]])

@@ -45,13 +45,15 @@ class NuScenesExporter(BoxExporter):
     def encode(self, sequence: storage.Sequence) -> tuple[bytes, list[str]]:
         """Return the results by sample; and a note on the classes that are left out."""
         frames, notes = self.read(sequence)
-        table, absent = sequence.metadata.classes, set[str]()
+        table = sequence.metadata.classes
+        absent = set[str]()
         tokens = {n: frame_token(sequence.name, n) for n in self.frames(sequence)}
         poses = {frame.number: frame.first_T_scan for frame in frames}
         if self.tables is not None:
             recording, numbers, vehicle_T_scan = Origin.of(sequence, NuScenes, self.tables)
             assert isinstance(recording, NuScenesScene)
-            known, times = recording.sample_tokens(), recording.times()
+            known = recording.sample_tokens()
+            times = recording.times()
             tokens = {n: known[own] for n, own in numbers.items() if own in known}
             for number in poses:
                 global_T_vehicle = recording.poses().at(times[numbers[number]])
@@ -60,7 +62,8 @@ class NuScenesExporter(BoxExporter):
         for frame in frames:
             if frame.number not in tokens:
                 continue
-            token, pose = tokens[frame.number], poses[frame.number]
+            token = tokens[frame.number]
+            pose = poses[frame.number]
             velocity = rotate_vectors(pose @ invert(frame.first_T_scan), frame.values[:, :3])
             boxes = frame.boxes.transform(pose)
             for row, label in enumerate(boxes.labels.tolist()):

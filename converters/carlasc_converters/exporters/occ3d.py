@@ -105,10 +105,8 @@ class Occ3dExporter(GridExporter):
         Without the field `seen`, voxels that the LiDAR observed count as observed by cameras.
         """
         labels, known = self.read(sequence, frame)
-        semantics, mask = (
-            np.where(known, labels, self.free).astype(np.uint8),
-            known.astype(np.uint8),
-        )
+        semantics = np.where(known, labels, self.free).astype(np.uint8)
+        mask = known.astype(np.uint8)
         seen = self._read_seen(sequence, frame) & mask if self._has_seen(sequence) else mask
         buffer = io.BytesIO()
         np.savez_compressed(buffer, semantics=semantics, mask_lidar=mask, mask_camera=seen)
@@ -119,7 +117,9 @@ class Occ3dExporter(GridExporter):
 
     def _read_seen(self, sequence: storage.Sequence, frame: int) -> Uint8Array:
         """Return (200, 200, 16) 1 for voxels that any camera sees."""
-        name, axes, place = self.grid_of(sequence), sequence.metadata.axes, self.frame_of(sequence)
+        name = self.grid_of(sequence)
+        axes = sequence.metadata.axes
+        place = self.frame_of(sequence)
         seen = place.turn((sequence.read(f"{name}/seen", frame) > 0).astype(np.uint8), axes)
         spec = place.spec_in(sequence.grids[name], axes)
         return resample_to(seen, np.ones(spec.size, np.bool_), spec, self.target)[0].astype(
@@ -147,7 +147,8 @@ class Occ3dExporter(GridExporter):
         return {_ANNOTATIONS: json.dumps(content, indent=1).encode()}
 
     def _scene(self, part: Exported) -> dict[str, Any]:
-        sequence, place = part.sequence, self.frame_of(part.sequence)
+        sequence = part.sequence
+        place = self.frame_of(part.sequence)
         tokens = ["", *(frame_token(sequence.name, frame) for frame in part.frames), ""]
         documents = sequence.documents()
         scene = {}

@@ -103,13 +103,15 @@ class Traffic:
         vehicle = self.vehicles[index]
         front = self._point(vehicle, along_m + wheelbase_m / 2)
         rear = self._point(vehicle, along_m - wheelbase_m / 2)
-        middle, ahead = (front + rear) / 2, front - rear
+        middle = (front + rear) / 2
+        ahead = front - rear
         return translation((*middle, 0.0)) @ rotation_z(float(np.arctan2(ahead[1], ahead[0])))
 
     def _point(self, vehicle: Vehicle, along_m: float) -> FloatArray:
         leg = int(np.searchsorted(vehicle.starts, along_m, side="right")) - 1
         leg = min(max(leg, 0), len(vehicle.route) - 1)
-        lane, local = self.streets.lanes[vehicle.route[leg]], along_m - vehicle.starts[leg]
+        lane = self.streets.lanes[vehicle.route[leg]]
+        local = along_m - vehicle.starts[leg]
         if local < 0:  # before the first lane, the route is extended straight
             return lane.path[0] + local * (lane.path[1] - lane.path[0]) / np.linalg.norm(
                 lane.path[1] - lane.path[0]
@@ -174,7 +176,8 @@ class Traffic:
             )
             if index is None:
                 continue
-            vehicle, node = self.vehicles[index], self.streets.lanes[lane].end
+            vehicle = self.vehicles[index]
+            node = self.streets.lanes[lane].end
             if vehicle.granted > vehicle.leg:
                 continue  # already let in
             distance = vehicle.starts[vehicle.leg + 1] - vehicle.along_m - vehicle.length_m / 2
@@ -273,7 +276,8 @@ class Traffic:
         """
         vehicle = self.vehicles[index]
         leg = self._street_leg(vehicle)
-        nearest, speed = np.inf, 0.0
+        nearest = np.inf
+        speed = 0.0
         for ahead in range(leg, min(leg + 3, len(vehicle.route))):
             lane = vehicle.route[ahead]
             if self.streets.lanes[lane].turn:
@@ -288,7 +292,8 @@ class Traffic:
                     continue
                 gap = position - vehicle.along_m - (leader.length_m + vehicle.length_m) / 2
                 if gap < nearest:
-                    nearest, speed = gap, leader.speed_mps
+                    nearest = gap
+                    speed = leader.speed_mps
             if nearest < np.inf:
                 break
         return float(nearest), speed
