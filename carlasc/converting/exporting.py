@@ -19,7 +19,6 @@ from carlasc.converting.exporter import (
     FrameExporter,
     SequenceExporter,
     SequenceFile,
-    WholeFileExporter,
 )
 from carlasc.converting.protocol import Failure, check_outside
 from carlasc.converting.registry import load_exporter, read_options
@@ -311,18 +310,12 @@ def _is_whole(exporter: Exporter, exported: Exported, folder: Path) -> bool:
     if isinstance(exporter, SequenceExporter):
         path = folder / exporter.file(sequence)
         return has_content(path) and set(exported.frames) <= set(exporter.frames_in(path, sequence))
-    assert isinstance(exporter, FrameExporter)
     return all(_exists(exporter, sequence, frame, folder) for frame in exported.frames)
 
 
 def _exists(exporter: Exporter, sequence: storage.Sequence, frame: int, folder: Path) -> bool:
     """Whether all files of a frame exist, or the file of its sequence."""
-    files: Iterable[str] = ()
-    if isinstance(exporter, FrameExporter):
-        files = exporter.frame_files(sequence, frame)
-    elif isinstance(exporter, SequenceExporter):
-        files = (exporter.file(sequence),)
-    return all(has_content(folder / file) for file in files)
+    return all(has_content(folder / file) for file in exporter.frame_files(sequence, frame))
 
 
 _UNKNOWN = (
@@ -507,8 +500,7 @@ class _SequenceExport:
         exporter = self.exporter
         sequence = exported.sequence
         assert isinstance(exporter, SequenceExporter)
-        again = self._again or isinstance(exporter, WholeFileExporter)
-        if not again and _is_whole(exporter, exported, folder):
+        if not self._again and _is_whole(exporter, exported, folder):
             self._skip(len(exported.frames))
             return {}
         path = folder / exporter.file(sequence)

@@ -257,7 +257,6 @@ class FrameFacts:
         frame: int,
         arrays: Mapping[str, AnyArray],
         grid: str,
-        spec: GridSpec,
         classes: ClassTable,
         changes: Changes | None = None,
         residuals: Mapping[int, Residual] | None = None,
@@ -268,7 +267,6 @@ class FrameFacts:
             frame: frame number.
             arrays: the fields of the frame, by name; those of the grid among them.
             grid: name of the grid's folder.
-            spec: geometry of the grid.
             classes: class table of the grid's labels.
             changes: as in the attributes.
             residuals: as in the attributes.
@@ -501,7 +499,6 @@ class Report:
         *,
         actors: Sequence[Mapping[str, Any]] | None = None,
         poses: PoseFacts | None = None,
-        holdout: Mapping[str, Any] | None = None,
     ) -> Self:
         """Make a report.
 
@@ -513,7 +510,6 @@ class Report:
             documents: the text files that belong to the grid, by name.
             actors: the facts of each actor, by number; None if actors were not tracked.
             poses: as in the attributes.
-            holdout: as in the attributes.
         """
         rows = sorted(facts, key=lambda row: row.frame)
         frames = tuple(row.frame for row in rows)
@@ -537,7 +533,7 @@ class Report:
             else actors_of(actors, (row.residuals for row in rows), classes),
             poses=poses,
             inferred_share=share,
-            holdout=holdout,
+            holdout=None,
             digests={name: _digests(rows, name) for name in names},
             documents={name: FileDigest.of(data) for name, data in sorted(documents.items())},
             versions=_versions(),

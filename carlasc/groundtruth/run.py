@@ -435,9 +435,7 @@ class FrameTask:
                 raise MissingDataError(f"frame {number}", expected="in the source", found="none")
             changes = None if thinned is None else Changes.between(grid, thinned)
             residuals = None if frame is None else frame.residuals()
-            facts = FrameFacts.of(
-                number, arrays, plan.grid, plan.spec, self.classes, changes, residuals
-            )
+            facts = FrameFacts.of(number, arrays, plan.grid, self.classes, changes, residuals)
         except MemoryError as error:
             raise CarlascError(
                 str(plan.spec),

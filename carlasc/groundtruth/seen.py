@@ -198,7 +198,7 @@ def _reach_points(points, eye, solid, reached):  # type: ignore[no-untyped-def]
             x = int(np.floor(at_x))
             y = int(np.floor(at_y))
             z = int(np.floor(at_z))
-            is_outside = x < 0 or y < 0 or z < 0 or x >= size[0] or y >= size[1] or z >= size[2]
+            is_outside = _is_outside(x, y, z, size)
             if first >= 1.0 or is_outside or _reaches((at_x, at_y, at_z), eye, (x, y, z), solid):
                 reached[n] = True
                 break
@@ -207,46 +207,46 @@ def _reach_points(points, eye, solid, reached):  # type: ignore[no-untyped-def]
 @jit
 def _reaches(at, eye, cell, solid):  # type: ignore[no-untyped-def]
     """Return whether no obstacle lies between a position in a voxel and the eye."""
-    size, (x, y, z) = solid.size, cell
-    ray = ray_x, ray_y, ray_z = eye[0] - at[0], eye[1] - at[1], eye[2] - at[2]
-    step_x = 1 if ray_x > 0 else -1
-    step_y = 1 if ray_y > 0 else -1
-    step_z = 1 if ray_z > 0 else -1
-    each_x = abs(1.0 / ray_x) if ray_x != 0 else np.inf
-    each_y = abs(1.0 / ray_y) if ray_y != 0 else np.inf
-    each_z = abs(1.0 / ray_z) if ray_z != 0 else np.inf
-    next_x = (x + (ray_x > 0) - at[0]) / ray_x if ray_x != 0 else np.inf
-    next_y = (y + (ray_y > 0) - at[1]) / ray_y if ray_y != 0 else np.inf
-    next_z = (z + (ray_z > 0) - at[2]) / ray_z if ray_z != 0 else np.inf
-    while True:
+    size = solid.size
+    x, y, z = cell
+    ray = eye[0] - at[0], eye[1] - at[1], eye[2] - at[2]
+    step_x, each_x, next_x = _steps(at[0], ray[0], x)
+    step_y, each_y, next_y = _steps(at[1], ray[1], y)
+    step_z, each_z, next_z = _steps(at[2], ray[2], z)
+    while min(next_x, next_y, next_z) < 1.0:
         if next_x <= next_y and next_x <= next_z:
-            if next_x >= 1.0:
-                return True
             x += step_x
             next_x += each_x
-            if x < 0 or x >= size[0]:
-                return True
         elif next_y <= next_z:
-            if next_y >= 1.0:
-                return True
             y += step_y
             next_y += each_y
-            if y < 0 or y >= size[1]:
-                return True
         else:
-            if next_z >= 1.0:
-                return True
             z += step_z
             next_z += each_z
-            if z < 0 or z >= size[2]:
-                return True
+        if _is_outside(x, y, z, size):
+            return True
         voxel = (x * size[1] + y) * size[2] + z
-        if solid.occupied[voxel]:
-            # the voxel of the eye itself stops no ray
-            if next_x >= 1.0 and next_y >= 1.0 and next_z >= 1.0:
-                return True
-            if _is_stopped(at, ray, (x, y, z), voxel, solid):
-                return False
+        if not solid.occupied[voxel] or min(next_x, next_y, next_z) >= 1.0:
+            continue  # the voxel of the eye itself stops no ray
+        if _is_stopped(at, ray, (x, y, z), voxel, solid):
+            return False
+    return True
+
+
+@jit
+def _steps(at, ray, cell):  # type: ignore[no-untyped-def]
+    """Return how a ray steps from voxel to voxel along an axis: in which direction, how much of the
+    ray each step takes, and how much lies before the first one.
+    """
+    if ray == 0:
+        return 1, np.inf, np.inf
+    return (1 if ray > 0 else -1), abs(1.0 / ray), (cell + (ray > 0) - at) / ray
+
+
+@jit
+def _is_outside(x, y, z, size):  # type: ignore[no-untyped-def]
+    """Return whether a cell is not in the grid."""
+    return x < 0 or y < 0 or z < 0 or x >= size[0] or y >= size[1] or z >= size[2]
 
 
 @jit

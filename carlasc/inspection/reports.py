@@ -316,7 +316,6 @@ def _measure(task: _ReportedFrame) -> FrameFacts | FrameFailure:
             for n in names
             if n in present and number in sequence.frames(n)
         }
-        spec = sequence.grids[grid]
         classes = sequence.classes_of(grid)
         changes = None
         residuals = None if task.scans is None else task.scans.residuals()
@@ -325,7 +324,7 @@ def _measure(task: _ReportedFrame) -> FrameFacts | FrameFailure:
             thinned = task.scans.thinned(task.plan)
         if thinned is not None:
             changes = Changes.between(sequence.grid(grid, number), thinned)
-        return FrameFacts.of(number, arrays, grid, spec, classes, changes, residuals)
+        return FrameFacts.of(number, arrays, grid, classes, changes, residuals)
     except (CarlascError, OSError) as error:
         return FrameFailure(sequence.location, number, str(error))
 

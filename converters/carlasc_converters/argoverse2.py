@@ -24,9 +24,10 @@ from carlasc.core import CameraModel
 from carlasc.core.arrays import AnyFloatArray, FloatArray, IntArray, Uint32Array
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import translation
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError
 from carlasc_converters.argoverse2_classes import ARGOVERSE2, CATEGORIES, TO_CARLA
 from carlasc_converters.feather import read_columns
+from carlasc_converters.files import missing_scans, no_data
 from carlasc_converters.image_files import nearest_images
 from carlasc_converters.transforms import poses_of
 
@@ -73,11 +74,10 @@ class Argoverse2(Converter):
             path.parents[1] for pattern in patterns for path in root.glob(pattern) if path.is_dir()
         }
         if not logs:
-            raise MissingDataError(
+            raise no_data(
                 self.source,
-                expected="logs: folders with sensors/lidar/ in them",
-                found="none" if root.is_dir() else "no such folder",
-                advice="give the folder that holds train/, val/ or test/, one of these, or one log",
+                "logs: folders with sensors/lidar/ in them",
+                "give the folder that holds train/, val/ or test/, one of these, or one log",
             )
         return [Argoverse2Log(log) for log in sorted(logs, key=lambda log: (log.name, str(log)))]
 
@@ -297,16 +297,8 @@ class Argoverse2Log(Recording):
     def problems(self) -> list[tuple[int, str]]:
         """Return the annotated sweeps without a file that are between sweeps with files."""
         lidar = self.folder / "sensors" / "lidar"
-        errors = (
-            (
-                number,
-                MissingDataError(
-                    lidar / f"{at}.feather", expected="an annotated sweep", found="no such file"
-                ),
-            )
-            for number, at in self._missing[0]
-        )
-        return [(number, str(error)) for number, error in errors]
+        files = [(number, lidar / f"{at}.feather") for number, at in self._missing[0]]
+        return missing_scans(files, "an annotated sweep")
 
     def notes(self) -> list[str]:
         """Return notes on what is missing in the log."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -37,6 +37,7 @@ _AROUND_NS = 10**9  # a frame needs the motion of a LiDAR on the vehicle around 
 _WORLDS = ("odom", "map", "world")  # names of frames that do not move, the smoothest first
 
 
+@dataclass(eq=False)
 class Bag(Converter):
     """Reads bags of ROS 1 (.bag), ROS 2 (.db3, .mcap) and Foxglove (.mcap), without ROS."""
 
@@ -45,33 +46,27 @@ class Bag(Converter):
     classes = CARLA
     to_carla = None
 
-    def __init__(
-        self,
-        source: Path,
-        *,
-        topics: Annotated[
-            str | None,
-            "Topics of points, one per LiDAR, with commas. The messages of the first are the "
-            "frames.",
-        ] = None,
-        pose_topic: Annotated[
-            str | None, "Topic of the poses, or /tf. Needed only if there are several."
-        ] = None,
-        pose_frame: Annotated[
-            str | None, "Coordinate frame of the poses, if the messages do not name it."
-        ] = None,
-        world_frame: Annotated[
-            str | None, "Reference frame of poses from /tf, such as odom, map or world."
-        ] = None,
-        time_unit: Annotated[
-            TimeUnit, "Unit of the times of points. auto: from the duration of a scan."
-        ] = "auto",
-        deskewed: Annotated[
-            bool, "The points are already corrected for the motion of the vehicle."
-        ] = False,
-    ) -> None:
-        super().__init__(source)
-        self.options = BagOptions(topics, pose_topic, pose_frame, world_frame, time_unit, deskewed)
+    source: Path
+    _: KW_ONLY
+    topics: Annotated[
+        str | None,
+        "Topics of points, one per LiDAR, with commas. The messages of the first are the frames.",
+    ] = None
+    pose_topic: Annotated[
+        str | None, "Topic of the poses, or /tf. Needed only if there are several."
+    ] = None
+    pose_frame: Annotated[
+        str | None, "Coordinate frame of the poses, if the messages do not name it."
+    ] = None
+    world_frame: Annotated[
+        str | None, "Reference frame of poses from /tf, such as odom, map or world."
+    ] = None
+    time_unit: Annotated[
+        TimeUnit, "Unit of the times of points. auto: from the duration of a scan."
+    ] = "auto"
+    deskewed: Annotated[bool, "The points are already corrected for the motion of the vehicle."] = (
+        False
+    )
 
     def sequences(self) -> list[Recording]:
         """Return the recordings, by name.
@@ -81,19 +76,7 @@ class Bag(Converter):
             ArgumentError: one has several topics of points, and none is named.
             FormatError: a file is not a bag.
         """
-        return [BagRecording(BagFiles(paths), self.options) for paths in find_bags(self.source)]
-
-
-@dataclass(frozen=True)
-class BagOptions:
-    """The options of `Bag`; see there."""
-
-    topics: str | None = None
-    pose_topic: str | None = None
-    pose_frame: str | None = None
-    world_frame: str | None = None
-    time_unit: TimeUnit = "auto"
-    deskewed: bool = False
+        return [BagRecording(BagFiles(paths), self) for paths in find_bags(self.source)]
 
 
 class BagRecording(Recording):
@@ -108,7 +91,7 @@ class BagRecording(Recording):
 
     split = "Train"
 
-    def __init__(self, files: BagFiles, options: BagOptions) -> None:
+    def __init__(self, files: BagFiles, options: Bag) -> None:
         self._files = files
         self._options = options
         self.location = files.location

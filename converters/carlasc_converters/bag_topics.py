@@ -46,7 +46,7 @@ from carlasc_converters.bag_messages import (
     read_stamp,
 )
 from carlasc_converters.files import opening, raw_advice
-from carlasc_converters.image_files import nearest_rows
+from carlasc_converters.image_files import nearest_within
 from carlasc_converters.point_fields import (
     TIMES,
     PointClock,
@@ -459,17 +459,10 @@ class LidarTopic:
         """
         own = self.stamps
         reach = float(np.median(np.diff(own))) if len(own) > 1 else float("inf")
-        rows = np.searchsorted((own[:-1] + own[1:]) // 2, stamps)
-        near = np.abs(own[rows] - stamps) <= reach
-        if not near.all():
-            self.notes.append(
-                f"{self.name}: has no message near {np.count_nonzero(~near)} of {len(stamps)} "
-                f"frames"
-            )
-        return [
-            self.places[row] if there else None
-            for row, there in zip(rows.tolist(), near.tolist(), strict=True)
-        ]
+        rows = nearest_within(own, stamps, reach)
+        if far := rows.count(None):
+            self.notes.append(f"{self.name}: has no message near {far} of {len(stamps)} frames")
+        return [None if row is None else self.places[row] for row in rows]
 
 
 @dataclass(frozen=True)
@@ -601,13 +594,8 @@ class BagCamera:
         """Return the row of the image nearest to each of (F,) times, nanoseconds; None if it is
         nearer to another frame.
         """
-        times, _ = self.images
-        if not len(times):
-            return [None] * len(frames)
         period = float(np.median(np.diff(frames))) if len(frames) > 1 else np.inf
-        rows = nearest_rows(times, frames)
-        near = np.abs(times[rows] - frames) <= period / 2
-        return [row if ok else None for row, ok in zip(rows.tolist(), near.tolist(), strict=True)]
+        return nearest_within(self.images[0], frames, period / 2)
 
     def model(self, vehicle_T_camera: Transform, times: FloatArray | None) -> CameraModel:
         """Return the camera; images that the topic calls rectified have no distortion.

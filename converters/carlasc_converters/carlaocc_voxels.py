@@ -9,13 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from carlasc.core.arrays import AnyArray, BoolArray, IntArray, LabelArray, Uint8Array
+from carlasc.core.arrays import BoolArray, IntArray, LabelArray, Uint8Array
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLAOCC
-from carlasc.errors import FormatError, MissingDataError
-from carlasc.storage.arrays import NUMBERS, ArrayFormat, check_size, open_npz
+from carlasc.errors import FormatError
+from carlasc.storage.arrays import NUMBERS, ArrayFormat, check_size
 from carlasc.storage.voxel_files import GridFrames, SeenBy, VoxelFormat
+from carlasc_converters.files import read_arrays
 
+_COPY = "the file is incomplete: copy it again"
 CARLAOCC_GRIDS = ("vs_0_4_surround_view", "vs_0_2_forward_view", "vs_0_1")
 """Names of grids. The first existing one is the default."""
 
@@ -102,9 +104,9 @@ def read_voxels(path: str | Path, spec: GridSpec) -> tuple[Uint8Array, BoolArray
     Raises:
         FormatError: the file is not a grid of this geometry.
     """
-    rows = _read_arrays(path, {"occupancy": ArrayFormat(("<u2",), (None, 4), 4 * spec.num_voxels)})[
-        0
-    ]
+    rows = read_arrays(
+        path, {"occupancy": ArrayFormat(("<u2",), (None, 4), 4 * spec.num_voxels)}, _COPY
+    )[0]
     cells = rows[:, :3].astype(np.int64)
     if outside := int((cells >= spec.size).any(axis=1).sum()):
         raise FormatError(
@@ -137,8 +139,8 @@ def read_geometry(path: str | Path) -> GridSpec:
         FormatError: the file does not describe a grid.
     """
     few = ArrayFormat(NUMBERS, None, 3)
-    step, origin, size = _read_arrays(
-        path, dict.fromkeys(("voxel_size", "voxel_origin", "volume_size"), few)
+    step, origin, size = read_arrays(
+        path, dict.fromkeys(("voxel_size", "voxel_origin", "volume_size"), few), _COPY
     )
     try:
         lower = np.asarray(origin, np.float64).reshape(3)
@@ -158,12 +160,3 @@ def read_geometry(path: str | Path) -> GridSpec:
             expected="voxel_size, and 3 values of voxel_origin and volume_size",
             found=error,
         ) from error
-
-
-def _read_arrays(path: str | Path, formats: dict[str, ArrayFormat]) -> list[AnyArray]:
-    try:
-        with open_npz(path) as arrays:
-            return [arrays.read(name, expected) for name, expected in formats.items()]
-    except (MissingDataError, FormatError) as error:
-        error.advice = error.advice or "the file is incomplete: copy it again"
-        raise

@@ -17,8 +17,8 @@ from carlasc.converting import Cloud, FrameHandle, Recording, Sensor, Split, Tra
 from carlasc.core import CameraModel
 from carlasc.core.arrays import Float32Array, FloatArray, IntArray
 from carlasc.core.geometry import Transform, check_rigid, invert
-from carlasc.errors import FormatError, MissingDataError
-from carlasc_converters.files import Version, read_text, version_of
+from carlasc.errors import FormatError
+from carlasc_converters.files import Version, no_data, read_text, version_of
 from carlasc_converters.kitti360_classes import KITTI360, KITTI360_TO_CARLA
 from carlasc_converters.kitti360_labels import MAX_DISTANCE_M, label_points, window_at, windows_of
 from carlasc_converters.kitti_cameras import rectified_cameras
@@ -66,11 +66,10 @@ class Kitti360(KittiConverter):
             if path.is_dir()
         )
         if not folders:
-            raise MissingDataError(
+            raise no_data(
                 self.source,
-                expected=f"data_3d_raw/2013_05_28_drive_0000_sync/{_SCANS}/data/ and so on",
-                found="none" if source.is_dir() else "no folder",
-                advice="give the folder that holds data_3d_raw/, data_poses/ and calibration/",
+                f"data_3d_raw/2013_05_28_drive_0000_sync/{_SCANS}/data/ and so on",
+                "give the folder that holds data_3d_raw/, data_poses/ and calibration/",
             )
         return [Kitti360Drive(Kitti360Files(str(source), name)) for name in folders]
 

@@ -6,29 +6,28 @@ See `docs/sets/kitti-tracking.md`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
-from carlasc.converting import Cloud, FrameHandle, Recording, Sensor, Split, Trajectory
+from carlasc.converting import FrameHandle, Recording, Sensor, Split, Trajectory
 from carlasc.core.arrays import FloatArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import Transform, invert
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError
+from carlasc_converters.files import no_data
 from carlasc_converters.kitti_boxes import KITTI, KITTI_TO_CARLA, ONLY_IN_VIEW, BoxRows, class_of
 from carlasc_converters.kitti_cameras import rectified_cameras
 from carlasc_converters.kitti_files import (
     HEIGHT_M,
     Calibration,
     KittiConverter,
+    SweepFrame,
     frames_of,
     read_lines,
-    read_scan,
-    sweep_seconds,
 )
 from carlasc_converters.oxts import read_packets, world_T_imu
 
@@ -73,12 +72,10 @@ class KittiTracking(KittiConverter):
                 for name in names
             ]
         if not recordings:
-            raise MissingDataError(
+            raise no_data(
                 self.source,
-                expected="training/velodyne/0000/ and so on, or one of the folders training and "
-                "testing",
-                found="none" if self.source.is_dir() else "no folder",
-                advice="give the folder that holds training/",
+                "training/velodyne/0000/ and so on, or one of the folders training and testing",
+                "give the folder that holds training/",
             )
         return recordings
 
@@ -104,7 +101,7 @@ class TrackingSequence(Recording):
     @cached_property
     def frames(self) -> Sequence[FrameHandle]:  # type: ignore[override]
         """The frames that have a scan."""
-        return [TrackingFrame(self.location, number) for number in self._numbers]
+        return [SweepFrame(f"{self.location}/{n:06d}.bin", n, PERIOD_S) for n in self._numbers]
 
     @cached_property
     def _numbers(self) -> list[int]:
@@ -216,24 +213,6 @@ class TrackingSequence(Recording):
         )
         view = [ONLY_IN_VIEW] if self._file("label_02").is_file() else []
         return [times, *view]
-
-
-@dataclass(frozen=True)
-class TrackingFrame(FrameHandle):
-    """One scan."""
-
-    folder: str
-    number: int
-
-    @property
-    def location(self) -> str:  # type: ignore[override]
-        """The file of the points."""
-        return f"{self.folder}/{self.number:06d}.bin"
-
-    def read(self) -> Sequence[Cloud]:
-        """Read the points, and find their times from their azimuths."""
-        points = read_scan(self.location)
-        return [Cloud(points, seconds=sweep_seconds(points, PERIOD_S))]
 
 
 def _camera_T_lidar(calibration: Calibration) -> Transform:

@@ -18,7 +18,7 @@ from carlasc.core.arrays import AnyArray, FloatArray, IntArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, check_rigid, invert, multiply, quaternions_of
 from carlasc.errors import FormatError, MissingDataError, count
-from carlasc_converters.files import opening, sequence_name
+from carlasc_converters.files import no_data, opening, sequence_name
 from carlasc_converters.kitti_boxes import BoxRows
 from carlasc_converters.ncore_cameras import NcoreCamera
 from carlasc_converters.ncore_classes import NCORE, NCORE_TO_CARLA, OTHER_OBJECT, class_of_name
@@ -64,11 +64,10 @@ class Ncore(Converter):
             stores[path.parent, str(about["sequence_id"])].append(store)
         recordings = [NcoreRecording(name, parts) for (_, name), parts in sorted(stores.items())]
         if not recordings:
-            raise MissingDataError(
+            raise no_data(
                 self.source,
-                expected=f"stores of NCore: {' or '.join(f'*{suffix}' for suffix in SUFFIXES)}",
-                found="none",
-                advice="check the path, or unpack the archives",
+                f"stores of NCore: {' or '.join(f'*{suffix}' for suffix in SUFFIXES)}",
+                "check the path, or unpack the archives",
             )
         return list(recordings)
 
@@ -161,7 +160,7 @@ class NcoreRecording(Recording):
     @cached_property
     def _slack_us(self) -> float:
         """Half of the time between frames: data farther from a frame do not belong to it."""
-        ends = self._first[:, 1]
+        ends = self.ends_us
         return float(np.median(np.diff(ends))) / 2 if len(ends) > 1 else _ALONE_US
 
     @cached_property
@@ -169,7 +168,7 @@ class NcoreRecording(Recording):
         """The frames of the first LiDAR, each with the frames of the other ones that are nearest to
         it in time.
         """
-        ends = self._first[:, 1]
+        ends = self.ends_us
         parts: list[list[tuple[int, str, str]]] = [[] for _ in ends]
         for index, (name, (store, group)) in enumerate(self._lidars.items()):
             own = self._spans[name][:, 1]
@@ -233,15 +232,10 @@ class NcoreRecording(Recording):
         Raises:
             MissingDataError: there are several, and no poses between them.
         """
-        at = self._first[:1, 1] * _NS
+        at = self.ends_us[:1] * _NS
         sensors = []
         for name in self._lidars:
-            if not self._tree.connected(name, self.vehicle):
-                raise MissingDataError(
-                    self.location,
-                    expected=f"poses from {name} to {self.vehicle}",
-                    found=self._tree,
-                )
+            self._check_connected(name)
             sensors.append(
                 Sensor(name, self._tree.lookup(self.vehicle, name, at)[0], deskewed=False)
             )
@@ -249,7 +243,7 @@ class NcoreRecording(Recording):
 
     def times(self) -> FloatArray:
         """Return seconds after the first frame."""
-        return self._seconds(self._first[:, 1])
+        return self._seconds(self.ends_us)
 
     def _seconds(self, stamps_us: AnyArray) -> FloatArray:
         return (stamps_us - self._first[0, 1]) / 1e6
@@ -330,14 +324,13 @@ class NcoreRecording(Recording):
     def _images(self) -> dict[str, list[int | None]]:
         """The row of the image of each frame, by camera."""
         return {
-            camera.name: camera.nearest(self._first[:, 1], self._slack_us)
-            for camera in self._cameras
+            camera.name: camera.nearest(self.ends_us, self._slack_us) for camera in self._cameras
         }
 
     def cameras(self) -> Sequence[CameraModel]:
         """Return the cameras with a model of the layout and with poses that lead to the vehicle."""
         models = []
-        at = self._first[:1, 1] * _NS
+        at = self.ends_us[:1] * _NS
         for camera in self._cameras:
             if camera.unknown is None and self._tree.connected(camera.name, self.vehicle):
                 middles = self._seconds(camera.spans.mean(axis=1))
@@ -388,20 +381,18 @@ class NcoreRecording(Recording):
 
     def _frame_at(self, stamp_us: int) -> int:
         """Return the frame that contains a time, or the nearest one; -1 if none is near."""
-        away = np.maximum(self._first[:, 0] - stamp_us, 0) + np.maximum(
-            stamp_us - self._first[:, 1], 0
-        )
+        away = np.maximum(self._first[:, 0] - stamp_us, 0) + np.maximum(stamp_us - self.ends_us, 0)
         frame = int(np.argmin(away))
         return frame if away[frame] <= self._slack_us else -1
 
+    def _check_connected(self, frame: str) -> None:
+        if not self._tree.connected(frame, self.vehicle):
+            expected = f"poses from {frame} to {self.vehicle}"
+            raise MissingDataError(self.location, expected=expected, found=self._tree)
+
     def _between(self, reference: str, stamps: IntArray) -> Transform:
         """Return (4, 4) from a frame at the second time to the rig at the first time."""
-        if not self._tree.connected(reference, self.vehicle):
-            raise MissingDataError(
-                self.location,
-                expected=f"poses from {reference} to {self.vehicle}",
-                found=self._tree,
-            )
+        self._check_connected(reference)
         root = self._tree.ancestors(self.vehicle)[-1]
         now = self._tree.lookup(root, self.vehicle, stamps[:1])[0]
         then = self._tree.lookup(root, reference, stamps[1:])[0]

@@ -15,7 +15,7 @@ from carlasc.core.cameras import Lens
 from carlasc.core.geometry import Transform
 from carlasc.errors import FormatError
 from carlasc_converters.files import opening
-from carlasc_converters.image_files import nearest_rows
+from carlasc_converters.image_files import nearest_within
 from carlasc_converters.ncore_store import NcoreStore
 
 _ENDINGS = {"jpeg": "jpg", "jpg": "jpg", "png": "png"}
@@ -64,12 +64,7 @@ class NcoreCamera:
         """Return the row of the image whose middle is nearest to each of (F,) times, microseconds;
         None if none is near enough.
         """
-        if not len(self.spans):
-            return [None] * len(ends)
-        middles = self.spans.mean(axis=1).astype(np.int64)
-        rows = nearest_rows(middles, ends)
-        near = np.abs(middles[rows] - ends) <= within
-        return [row if ok else None for row, ok in zip(rows.tolist(), near.tolist(), strict=True)]
+        return nearest_within(self.spans.mean(axis=1).astype(np.int64), ends, within)
 
     def model(self, vehicle_T_camera: Transform, times: FloatArray | None) -> CameraModel:
         """Return the camera; `times` are those of the images of each frame, seconds.

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from dataclasses import KW_ONLY, dataclass
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -16,6 +17,7 @@ from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc_converters.files import missing_scans, no_data
 from carlasc_converters.image_files import nearest_images
 from carlasc_converters.nuscenes_classes import MINI_VALIDATION, NUSCENES, TO_CARLA, VALIDATION
 from carlasc_converters.nuscenes_frames import NuScenesFrame
@@ -25,6 +27,7 @@ from carlasc_converters.transforms import poses_of
 _NEAR_US = 50_000  # greatest time between an image and its scan
 
 
+@dataclass(eq=False)
 class NuScenes(Converter):
     """Reads nuScenes with its point labels and instances (lidarseg and panoptic), if they are
     installed.
@@ -41,20 +44,14 @@ class NuScenes(Converter):
     min_range_m = 2.5
     max_range_m = 50.0
 
-    def __init__(
-        self,
-        source: Path,
-        *,
-        version: Annotated[
-            str | None, "Folder of the tables, if there are several, such as v1.0-mini."
-        ] = None,
-        sweeps: Annotated[
-            bool, "Read all scans, 20 per second; without it, only key frames, 2 per second."
-        ] = True,
-    ) -> None:
-        super().__init__(source)
-        self.version = version
-        self.sweeps = sweeps
+    source: Path
+    _: KW_ONLY
+    version: Annotated[
+        str | None, "Folder of the tables, if there are several, such as v1.0-mini."
+    ] = None
+    sweeps: Annotated[
+        bool, "Read all scans, 20 per second; without it, only key frames, 2 per second."
+    ] = True
 
     def sequences(self) -> list[Recording]:
         """Return the scenes with files, by name. This reads the tables.
@@ -67,13 +64,14 @@ class NuScenes(Converter):
         tables = Tables(self._version())
         tables.check_categories()
         root = tables.folder.parent
-        names = _Names()
+        # each folder is listed once, because it may hold hundreds of thousands of files
+        names_in = cache(lambda folder: set(os.listdir(folder) if folder.is_dir() else ()))
         recordings: list[Recording] = []
         for scene in tables.scenes:
             present = {
                 scan.file
                 for scan in scene.scans
-                if (root / scan.file).name in names.of(root / scan.file)
+                if (file := root / scan.file).name in names_in(file.parent)
             }
             if present:
                 recordings.append(NuScenesScene(tables, scene, present, all_scans=self.sweeps))
@@ -96,11 +94,10 @@ class NuScenes(Converter):
         folders = sorted(path.parent for path in root.glob("v*/scene.json"))
         listed = ", ".join(folder.name for folder in folders)
         if not folders:
-            raise MissingDataError(
+            raise no_data(
                 self.source,
-                expected="v1.0-mini/scene.json, or another version",
-                found="none" if root.is_dir() else "no such folder",
-                advice="give the folder that holds v1.0-mini/, samples/ and sweeps/",
+                "v1.0-mini/scene.json, or another version",
+                "give the folder that holds v1.0-mini/, samples/ and sweeps/",
             )
         chosen = [folder for folder in folders if asked in (None, folder.name)]
         if len(chosen) != 1:
@@ -108,23 +105,6 @@ class NuScenes(Converter):
                 "version", expected=f"one of {listed}", found=repr(asked) if asked else "no choice"
             )
         return chosen[0]
-
-
-class _Names:
-    """The names of the files in folders.
-
-    Each folder is listed once, because it may hold hundreds of thousands.
-    """
-
-    def __init__(self) -> None:
-        self._folders: dict[Path, frozenset[str]] = {}
-
-    def of(self, file: Path) -> frozenset[str]:
-        """Return the names of the files in the folder of a file."""
-        folder = file.parent
-        if folder not in self._folders:
-            self._folders[folder] = frozenset(os.listdir(folder) if folder.is_dir() else ())
-        return self._folders[folder]
 
 
 class NuScenesScene(Recording):
@@ -289,24 +269,12 @@ class NuScenesScene(Recording):
         """Return the scans that the tables list and that have no file."""
         root = self.tables.folder.parent
         advice = "unpack the archives of the sensor data again"
-        missing = [
-            (number, scan.file)
+        files = [
+            (number, root / scan.file)
             for number, scan in enumerate(self._scans)
             if scan.file not in self._present
         ]
-        errors = (
-            (
-                number,
-                MissingDataError(
-                    root / file,
-                    expected="a LiDAR scan that the tables list",
-                    found="no such file",
-                    advice=advice,
-                ),
-            )
-            for number, file in missing
-        )
-        return [(number, str(error)) for number, error in errors]
+        return missing_scans(files, "a LiDAR scan that the tables list", advice)
 
     def notes(self) -> list[str]:
         """Return notes on what is missing in the scene."""

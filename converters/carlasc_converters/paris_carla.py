@@ -20,7 +20,8 @@ from carlasc.core.arrays import Float32Array, FloatArray, IntArray
 from carlasc.core.classes import Remap
 from carlasc.core.geometry import Transform, invert, rotation_z, transform_points, translation
 from carlasc.core.tables import CARLA
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError
+from carlasc_converters.files import no_data
 from carlasc_converters.ply import PlyVertices
 
 _POINT = ("x", "y", "z")
@@ -64,11 +65,10 @@ class ParisCarla3D(Converter):
             else sorted(p for p in source.rglob("*.ply") if p.stem.startswith("Town"))
         )
         if not files:
-            raise MissingDataError(
+            raise no_data(
                 source,
-                expected="files such as Town01.ply",
-                found="none",
-                advice="give their folder, after the archives are unpacked",
+                "files such as Town01.ply",
+                "give their folder, after the archives are unpacked",
             )
         return [ParisCarlaTown(path) for path in files]
 

@@ -17,7 +17,7 @@ from carlasc.core.geometry import Transform
 from carlasc.errors import FormatError
 from carlasc.relabelling.predictions import load
 from carlasc.storage.arrays import NUMBERS, ArrayFormat, read_npy
-from carlasc_converters.files import opening
+from carlasc_converters.files import check_labels, opening
 from carlasc_converters.point_fields import (
     PointClock,
     TimeUnit,
@@ -139,6 +139,5 @@ def read_labels(path: Path, count: int) -> Uint32Array:
         with opening(path, "a class id for each point"):
             values = np.loadtxt(path, ndmin=1)
     labels = whole_numbers(np.asarray(values).reshape(-1), str(path))
-    if len(labels) != count:
-        raise FormatError(path, expected=f"a label for each of {count} points", found=len(labels))
+    check_labels(labels, count, path)
     return labels

@@ -12,7 +12,7 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -33,8 +33,8 @@ from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.geometry import translation
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, lines_of
-from carlasc.errors import ArgumentError, FormatError, MissingDataError, StorageError, import_extra
-from carlasc_converters.files import opening
+from carlasc.errors import ArgumentError, FormatError, StorageError, import_extra
+from carlasc_converters.files import no_data, opening
 
 # name, class of CarlaSC; the data count from 0, here 0 is unlabelled
 _CLASSES = [
@@ -83,6 +83,7 @@ _BATCH = 1 << 18  # rows in memory
 _ROW = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f8"), ("label", "u1")])
 
 
+@dataclass(eq=False)
 class SynthCity(Converter):
     """Reads the areas of SynthCity, or one of them."""
 
@@ -93,22 +94,15 @@ class SynthCity(Converter):
     to_carla = Remap("synthcity_to_carla", CLASSES, CARLA, _TARGETS)
     sensor = "simulated mobile mapping (BlenSor)"
 
-    def __init__(
-        self,
-        source: Path,
-        *,
-        columns: Annotated[
-            str | None,
-            "Names of columns, if they are not found automatically: "
-            "x=X_noise,y=Y_noise,label=Class.",
-        ] = None,
-        grid: Annotated[
-            Literal["coarse", "fine"], "Published grid with the size and voxels of tiles."
-        ] = "coarse",
-    ) -> None:
-        super().__init__(source)
-        self.columns = columns
-        self.grid = grid
+    source: Path
+    _: KW_ONLY
+    columns: Annotated[
+        str | None,
+        "Names of columns, if they are not found automatically: x=X_noise,y=Y_noise,label=Class.",
+    ] = None
+    grid: Annotated[
+        Literal["coarse", "fine"], "Published grid with the size and voxels of tiles."
+    ] = "coarse"
 
     def sequences(self) -> list[Recording]:
         """Return the areas, by name.
@@ -123,9 +117,7 @@ class SynthCity(Converter):
         files = [self.source] if self.source.is_file() else sorted(self.source.rglob("*.parquet"))
         if not files:
             advice = "give their folder, or one of the tables"
-            raise MissingDataError(
-                self.source, expected="Parquet tables, one per area", found="none", advice=advice
-            )
+            raise no_data(self.source, "Parquet tables, one per area", advice)
         return [
             SynthCityArea(path, _find_columns(path, named), GridSpec.published(self.grid))
             for path in files

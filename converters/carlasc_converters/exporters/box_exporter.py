@@ -4,6 +4,7 @@ of its field `boxes`, or those of a table.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, NamedTuple, Self
@@ -127,11 +128,11 @@ class FrameBoxes(NamedTuple):
     values: FloatArray
 
 
+@dataclass(eq=False)
 class BoxExporter(WholeFileExporter):
     """Writes the tracked boxes of each sequence to one file."""
 
-    def __init__(self, boxes: TableFile = None) -> None:
-        self.boxes = boxes
+    boxes: TableFile = None
 
     @property
     def of_one(self) -> str | None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -31,6 +32,7 @@ _MOSTLY = 0.5  # share of the occupied voxels above which structure without a cl
 _CARLASC_HEIGHT_M = 1.8  # docs/format.md#coordinate-frame
 
 
+@dataclass(eq=False)
 class GridExporter(FrameExporter):
     """Writes voxel grids of a given geometry, in classes of a given table.
 
@@ -49,9 +51,8 @@ class GridExporter(FrameExporter):
     free: ClassVar[int]
     slug: ClassVar[str]
 
-    def __init__(self, grid: GridName = None, *, predictions: Predictions = False) -> None:
-        self.grid = grid
-        self.predictions = predictions
+    grid: GridName = None
+    predictions: Predictions = field(default=False, kw_only=True)
 
     def frame_of(self, sequence: storage.Sequence) -> TargetFrame:
         """Return the frame of the grids that are written."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,30 +14,24 @@ from carlasc import storage
 from carlasc.converting import Exported, Files
 from carlasc.core.geometry import invert, rotate_vectors
 from carlasc.storage.files import parse_json
-from carlasc_converters.exporters.box_exporter import BoxExporter, Origin, TableFile, names_of
+from carlasc_converters.exporters.box_exporter import BoxExporter, Origin, names_of
 from carlasc_converters.exporters.occ3d import frame_token
 from carlasc_converters.nuscenes import NuScenes, NuScenesScene
 
 _META = {f"use_{name}": name == "lidar" for name in ("camera", "lidar", "radar", "map", "external")}
 
 
+@dataclass(eq=False)
 class NuScenesExporter(BoxExporter):
     """Writes the results of each sequence, and those of each split."""
 
     title = "nuScenes' results of tracking and detection: SPLIT.json and SPLIT/SEQUENCE.json"
 
-    def __init__(
-        self,
-        boxes: TableFile = None,
-        *,
-        tables: Annotated[
-            str | None,
-            "nuScenes, from which the sequences were converted: tokens and the global frame are "
-            "those of its tables.",
-        ] = None,
-    ) -> None:
-        super().__init__(boxes)
-        self.tables = tables
+    tables: Annotated[
+        str | None,
+        "nuScenes, from which the sequences were converted: tokens and the global frame are those "
+        "of its tables.",
+    ] = field(default=None, kw_only=True)
 
     def file(self, sequence: storage.Sequence) -> str:
         """Return SPLIT/SEQUENCE.json."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from hashlib import blake2b
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,12 +25,7 @@ from carlasc.core.geometry import mirror_poses, quaternions_of, translation
 from carlasc.core.grids import GridSpec
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json
-from carlasc_converters.exporters.grid_exporter import (
-    GridExporter,
-    GridName,
-    Predictions,
-    sensor_height,
-)
+from carlasc_converters.exporters.grid_exporter import GridExporter, sensor_height
 
 _ANNOTATIONS = "annotations.json"
 _CAMERAS = "mask_camera is a copy of mask_lidar, because no cameras are known"
@@ -47,6 +43,7 @@ def frame_token(name: str, frame: int) -> str:
     return f"{blake2b(name.encode(), digest_size=13).hexdigest()}{frame:06d}"
 
 
+@dataclass(eq=False)
 class Occ3dExporter(GridExporter):
     """Writes grids as Occ3D-nuScenes has them: 200 x 200 x 16 voxels of 0.4 m around the vehicle,
     with the origin on the ground.
@@ -58,19 +55,10 @@ class Occ3dExporter(GridExporter):
     free = 17
     slug = "occ3d"
 
-    def __init__(
-        self,
-        grid: GridName = None,
-        *,
-        predictions: Predictions = False,
-        height_m: Annotated[
-            float | None,
-            "Height of the sensor above the ground, in metres. Default: that in carlasc.json, or "
-            "1.8.",
-        ] = None,
-    ) -> None:
-        super().__init__(grid, predictions=predictions)
-        self.height_m = height_m
+    height_m: Annotated[
+        float | None,
+        "Height of the sensor above the ground, in metres. Default: that in carlasc.json, or 1.8.",
+    ] = field(default=None, kw_only=True)
 
     def frame_of(self, sequence: storage.Sequence) -> TargetFrame:
         """Return the frame of the vehicle, whose origin is on the ground below the sensor."""

@@ -11,7 +11,7 @@ import pickle
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -235,12 +235,11 @@ class OpenSceneFlowExporter(SequenceExporter):
         return {frame: str(_FIRST_NS + time) for frame, time in zip(frames, times, strict=True)}
 
 
-class _Step:
+class _Step(NamedTuple):
     """From a scan to the next one."""
 
-    def __init__(self, next_T_now: Transform, seconds: float) -> None:
-        self.next_T_now = next_T_now
-        self.seconds = seconds
+    next_T_now: Transform
+    seconds: float
 
     def flow(
         self,

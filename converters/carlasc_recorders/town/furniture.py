@@ -264,10 +264,7 @@ def mark_parking_bay(plan: TownPlan, side: Side) -> None:
     if not side.has_bay:
         return
     for at in np.arange(6.0, side.length_m - 6.0, 6.4):
-        pose = translation((*side.point(at, HALF_ROAD_M + BAY_M / 2 - 0.05), 0.0)) @ rotation_z(
-            side.yaw_rad
-        )
-        plan.parking.append(pose)
+        plan.park(side.point(at, HALF_ROAD_M + BAY_M / 2 - 0.05), side.yaw_rad, 0.0)
 
 
 def add_traffic_signals(plan: TownPlan, streets: Streets) -> None:

@@ -86,17 +86,7 @@ class MeshBuilder:
             size: (3,) or (N, 3) lengths along x, y and z of each box, metres.
             yaw_rad: () or (N,) rotations about z.
         """
-        base = np.array(base, np.float64, ndmin=2)
-        size = np.array(size, np.float64, ndmin=2)
-        count = max(len(base), len(size))
-        corners, faces = _unit_box()
-        local = corners * np.broadcast_to(size, (count, 3))[:, None, :]
-        moved = (
-            _rotate_z(local, np.broadcast_to(np.asarray(yaw_rad, np.float64), (count,)))
-            + base[:, None, :]
-        )
-        offsets = np.arange(count, dtype=np.int32)[:, None, None] * np.int32(len(corners))
-        self.add(label, moved.reshape(-1, 3), (faces + offsets).reshape(-1, 3))
+        self._copies(label, _unit_box(), base, np.array(size, np.float64, ndmin=2), yaw_rad)
 
     def level_rectangles(
         self, label: int, centre: ArrayLike, size: ArrayLike, yaw_rad: float = 0.0
@@ -109,15 +99,28 @@ class MeshBuilder:
             size: (2,) or (N, 2) lengths along x and y of each rectangle, metres.
             yaw_rad: rotation about z.
         """
-        centre = np.array(centre, np.float64, ndmin=2)
-        size = np.array(size, np.float64, ndmin=2)
         corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
-        local = corners * at_height(np.broadcast_to(size, (len(centre), 2)), 1.0)[:, None, :]
-        moved = _rotate_z(local, np.full(len(centre), yaw_rad)) + centre[:, None, :]
-        first = np.arange(len(centre), dtype=np.int32)[:, None, None] * np.int32(4)
-        self.add(
-            label, moved.reshape(-1, 3), (np.array([[0, 1, 2], [0, 2, 3]]) + first).reshape(-1, 3)
-        )
+        square = corners, np.array([[0, 1, 2], [0, 2, 3]])
+        sizes = at_height(np.array(size, np.float64, ndmin=2), 1.0)
+        self._copies(label, square, centre, sizes, yaw_rad)
+
+    def _copies(
+        self,
+        label: int,
+        shape: tuple[Vertices, IntArray],
+        place: ArrayLike,
+        sizes: FloatArray,
+        yaw_rad: ArrayLike,
+    ) -> None:
+        """Add copies of a shape of size 1: its corners and faces."""
+        corners, faces = shape
+        places = np.array(place, np.float64, ndmin=2)
+        count = max(len(places), len(sizes))
+        local = corners * np.broadcast_to(sizes, (count, 3))[:, None, :]
+        turns = np.broadcast_to(np.asarray(yaw_rad, np.float64), (count,))
+        moved = _rotate_z(local, turns) + places[:, None, :]
+        first = np.arange(count, dtype=np.int32)[:, None, None] * np.int32(len(corners))
+        self.add(label, moved.reshape(-1, 3), (faces + first).reshape(-1, 3))
 
     def cylinder(
         self,

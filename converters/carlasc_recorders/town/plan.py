@@ -234,6 +234,11 @@ class Land:
     boundary: Points
     occupied: list[Rectangle] = field(default_factory=list)
 
+    def draw(self, rng: np.random.Generator) -> Points:
+        """Return a random position, (2,), in the box around the land."""
+        low = self.boundary.min(axis=0)
+        return low + rng.uniform(0, 1, 2) * np.ptp(self.boundary, axis=0)
+
     def inside(self, points: Points, margin_m: float = 0.0) -> bool:
         """Whether all points (N, 2) are inside the boundary, and at least a margin away from it."""
         (start_x, start_y), (end_x, end_y) = self.boundary.T, np.roll(self.boundary, -1, axis=0).T
@@ -299,6 +304,10 @@ class TownPlan:
     builder: MeshBuilder = field(default_factory=MeshBuilder)
     buildings: list[tuple[Rectangle, float]] = field(default_factory=list)
     parking: list[Transform] = field(default_factory=list)
+
+    def park(self, position: FloatArray, yaw_rad: float, height_m: float) -> None:
+        """Add a place for a parked vehicle."""
+        self.parking.append(translation((*position, height_m)) @ rotation_z(yaw_rad))
 
     def add(
         self, mesh: Mesh, position: FloatArray, yaw_rad: float, height_m: float = KERB_M

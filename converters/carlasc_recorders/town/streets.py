@@ -237,12 +237,14 @@ def _trace_faces(nodes: Points, edges: IntArray) -> list[list[int]]:
     return loops
 
 
+def _unit(direction: Points) -> Points:
+    return direction / np.linalg.norm(direction)
+
+
 def _corner(nodes: Points, before: int, node: int, after: int) -> tuple[Points, Points, float]:
     """Return the directions into and out of a corner, and its turn to the right in radians."""
-    arriving = nodes[node] - nodes[before]
-    leaving = nodes[after] - nodes[node]
-    arriving = arriving / np.linalg.norm(arriving)
-    leaving = leaving / np.linalg.norm(leaving)
+    arriving = _unit(nodes[node] - nodes[before])
+    leaving = _unit(nodes[after] - nodes[node])
     turn = np.arctan2(arriving[0] * leaving[1] - arriving[1] * leaving[0], arriving @ leaving)
     return arriving, leaving, float(turn)
 
@@ -321,7 +323,7 @@ def _make_lanes(
     lanes: list[Lane] = []
     for a, b in edges.tolist():
         for start, end in ((a, b), (b, a)):
-            direction = (nodes[end] - nodes[start]) / np.linalg.norm(nodes[end] - nodes[start])
+            direction = _unit(nodes[end] - nodes[start])
             offset = LANE_WIDTH_M / 2 * right_of(direction)
             first = nodes[start] + stop_distances[start, end] * direction + offset
             last = nodes[end] - stop_distances[end, start] * direction + offset
@@ -359,8 +361,8 @@ def _curve(before: Points, after: Points) -> Points:
     """
     first = before[-1]
     last = after[0]
-    leaving = (before[-1] - before[-2]) / np.linalg.norm(before[-1] - before[-2])
-    arriving = (after[1] - after[0]) / np.linalg.norm(after[1] - after[0])
+    leaving = _unit(before[-1] - before[-2])
+    arriving = _unit(after[1] - after[0])
     reach = 0.38 * float(np.linalg.norm(last - first))
     control = np.stack([first, first + reach * leaving, last - reach * arriving, last])
     t = np.linspace(0, 1, max(8, int(reach / 0.38 / PATH_STEP_M) + 1))[:, None]

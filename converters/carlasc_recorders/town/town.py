@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from carlasc.core.arrays import FloatArray
-from carlasc.core.geometry import Transform, rotation_z, translation
+from carlasc.core.geometry import Transform
 from carlasc.core.tables import CARLA
 from carlasc_recorders.town import furniture
 from carlasc_recorders.town.furniture import (
@@ -201,10 +201,8 @@ def _add_front_garden(
     drive = side.point(along + width + 1.8, INNER_M + bay + 3.2)
     if land.reserve(Rectangle(drive, (2.6, 5.6), side.yaw_rad), 0.2):
         plan.builder.boxes(GROUND, (*drive, KERB_M - 0.3), (2.8, 6.2, 0.33), side.yaw_rad)
-        pose = translation((*drive, KERB_M + 0.03)) @ rotation_z(
-            side.yaw_rad + np.pi / 2 * float(rng.choice([-1, 1]))
-        )
-        plan.parking.append(pose)
+        turn = np.pi / 2 * float(rng.choice([-1, 1]))
+        plan.park(drive, side.yaw_rad + turn, KERB_M + 0.03)
     for _ in range(2):
         position = side.point(
             along + rng.uniform(0, width),
@@ -217,10 +215,8 @@ def _add_front_garden(
 def _add_yard(plan: TownPlan, block: CityBlock, land: Land, attempts: int) -> None:
     """Add trees, fences, walls, bushes and trash behind the buildings where the land is free."""
     rng = plan.rng
-    span = np.ptp(land.boundary, axis=0)
-    low = land.boundary.min(axis=0)
     for _ in range(attempts):
-        position = low + rng.uniform(0, 1, 2) * span
+        position = land.draw(rng)
         number = rng.random()
         if number < 0.55:
             if land.reserve(Rectangle(position, (2.4, 2.4), 0.0), 0.5, 1.5):
@@ -272,10 +268,8 @@ def _add_park(plan: TownPlan, block: CityBlock, land: Land) -> None:
                 at,
                 side.yaw_rad,
             )
-    low = land.boundary.min(axis=0)
-    span = np.ptp(land.boundary, axis=0)
     for _ in range(150):
-        position = low + rng.uniform(0, 1, 2) * span
+        position = land.draw(rng)
         number = rng.random()
         size = 2.6 if number < 0.5 else 1.4
         if not land.reserve(Rectangle(position, (size, size), 0.0), 0.4, 0.8):
@@ -313,14 +307,11 @@ def _add_square(plan: TownPlan, block: CityBlock, land: Land) -> None:
             position = edge.point(at, offset + 6.5)
             if land.reserve(Rectangle(position, (2.2, 5.4), edge.yaw_rad), 0.2, 0.5):
                 turn = np.pi / 2 * float(rng.choice([-1, 1]))
-                pose = translation((*position, KERB_M)) @ rotation_z(edge.yaw_rad + turn)
-                plan.parking.append(pose)
+                plan.park(position, edge.yaw_rad + turn, KERB_M)
                 line = edge.point(at + 1.4, offset + 6.5)
                 plan.builder.level_rectangles(
                     ROAD_LINE, (*line, KERB_M + PAINT_M), (0.12, 4.8), edge.yaw_rad
                 )
-    low = land.boundary.min(axis=0)
-    span = np.ptp(land.boundary, axis=0)
     makers: tuple[Callable[[], Mesh], ...] = (
         furniture.kiosk,
         lambda: furniture.planter(rng),
@@ -329,7 +320,7 @@ def _add_square(plan: TownPlan, block: CityBlock, land: Land) -> None:
         lambda: furniture.trash(rng),
     )
     for index in range(60):
-        position = low + rng.uniform(0, 1, 2) * span
+        position = land.draw(rng)
         if land.reserve(Rectangle(position, (3.2, 3.2), 0.0), 0.3, 1.0):
             plan.add(makers[index % len(makers)](), position, rng.uniform(0, 6))
 

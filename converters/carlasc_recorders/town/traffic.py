@@ -82,18 +82,21 @@ class Traffic:
         self._limits = [_speed_limit(lane) for lane in streets.lanes]
         for vehicle in vehicles:
             self._extend_route(vehicle)
-        self._along = [np.array([vehicle.along_m for vehicle in vehicles])]
-        self._speed = [np.array([vehicle.speed_mps for vehicle in vehicles])]
+        self._states = [self._state()]
 
     def at(self, frame: int) -> tuple[FloatArray, FloatArray]:
         """Return the distance along its route, (V,) metres, and the speed, (V,) m/s, of every
         vehicle in a frame.
         """
-        while len(self._along) <= frame:
-            self._step(len(self._along))
-            self._along.append(np.array([vehicle.along_m for vehicle in self.vehicles]))
-            self._speed.append(np.array([vehicle.speed_mps for vehicle in self.vehicles]))
-        return self._along[frame], self._speed[frame]
+        while len(self._states) <= frame:
+            self._step(len(self._states))
+            self._states.append(self._state())
+        return self._states[frame]
+
+    def _state(self) -> tuple[FloatArray, FloatArray]:
+        rows = [(vehicle.along_m, vehicle.speed_mps) for vehicle in self.vehicles]
+        along, speed = np.array(rows).reshape(-1, 2).T
+        return along, speed
 
     def pose(self, index: int, along_m: float, wheelbase_m: float) -> Transform:
         """Return (4, 4) world_T_vehicle of a vehicle at a distance along its route.
