@@ -345,9 +345,11 @@ class StoredSequence(SequenceInput):
     """A sequence of the layout. Its scans, poses, times and frame numbers are kept."""
 
     def __init__(self, sequence: Sequence, plan: GridPlan) -> None:
-        self.sequence, self.plan = sequence, plan
+        self.sequence = sequence
+        self.plan = plan
         self.path = layout.place_of(sequence.path)
-        self.location, self.metadata = sequence.location, sequence.metadata
+        self.location = sequence.location
+        self.metadata = sequence.metadata
 
     def files(self) -> FrameFiles | None:
         """Return the files of the scans."""
@@ -438,7 +440,8 @@ class InputCheck:
                 cannot be made.
             run: how the reading of files is spread.
         """
-        inputs, files = self.inputs, self.inputs.files()
+        inputs = self.inputs
+        files = self.inputs.files()
         record = self._record = MadeFrom.read(self.writer, self._name)
         kept = self.compare == "never" and existing and not self.is_provisional
         if files is None or kept:
@@ -527,7 +530,8 @@ class InputCheck:
         """
         if not self._whole:
             return
-        record, writer = self._record, self.writer
+        record = self._record
+        writer = self.writer
         if self.gone:
             written = [f"{self.grid}/{part}" for part in layout.GRID_FIELDS]
             writer.remove_frames([*self.copied, *written], self.gone)
@@ -549,7 +553,8 @@ class InputCheck:
 
     def _remove_others(self) -> None:
         """Remove from a copy the lines, text files and fields that the input has no longer."""
-        inputs, writer = self.inputs, self.writer
+        inputs = self.inputs
+        writer = self.writer
         of_frames = {layout.POSES: inputs.poses(), layout.TIMES: inputs.times()}
         for name, lines in of_frames.items():
             if self.gone and (left := agree_lines(writer, name, lines, is_whole=True)):
