@@ -32,6 +32,7 @@ from carlasc.core.compiling import cached, fused, inlined, jit
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import GridSpec
 
+_BLOCK = 256  # points whose voxels are found at once
 Real = Any  # float32 or float64: compiled code distinguishes them, the stubs of NumPy do not
 Triple = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
@@ -109,6 +110,21 @@ def find_voxel(x: float, y: float, z: float, cells: Cells) -> int:
     j = min(int((second - cells.lower[1]) / cells.voxel_size[1]), cells.size[1] - 1)
     k = min(int((z - cells.lower[2]) / cells.voxel_size[2]), cells.size[2] - 1)
     return (i * cells.size[1] + j) * cells.size[2] + k
+
+
+@inlined
+def find_in_box(x: float, y: float, z: float, cells: Cells) -> np.int32:
+    """Return what `find_voxel` returns in a Cartesian grid, without a branch, so that loops
+    vectorise.
+    """
+    lower, upper, size, voxel = cells.lower, cells.upper, cells.size, cells.voxel_size
+    inside = (x >= lower[0]) & (x < upper[0]) & (y >= lower[1]) & (y < upper[1])
+    inside &= (z >= lower[2]) & (z < upper[2])
+    i = min(np.floor((x - lower[0]) / voxel[0]), size[0] - 1.0)
+    j = min(np.floor((y - lower[1]) / voxel[1]), size[1] - 1.0)
+    k = min(np.floor((z - lower[2]) / voxel[2]), size[2] - 1.0)
+    voxel_count = size[0] * size[1] * size[2]
+    return np.int32((i * size[1] + j) * size[2] + k if inside else np.float64(voxel_count))
 
 
 # atan(t) / t as a polynomial of t^2, |t| <= tan(pi / 8): Chebyshev interpolation, off by less than
@@ -273,20 +289,32 @@ def count_points(
     """
     counts = np.zeros(spec.num_voxels, np.int32) if counts is None else counts
     poses = np.array([*map(as_pose, grid_T_points)]).reshape(-1, 12)
-    _count(np.ascontiguousarray(points), poses, Cells.of(spec), counts)
+    _count(np.ascontiguousarray(points.T), poses, Cells.of(spec), counts)
     return counts
 
 
 @cached
 def _count(points: AnyFloatArray, poses: FloatArray, cells: Cells, counts: Int32Array) -> None:
+    voxels = np.empty(_BLOCK, np.int32)
     for place in range(len(poses)):
         pose = pose_of(poses, place)
-        for i in range(len(points)):
-            point = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-            x, y, z = transform(pose, point[0], point[1], point[2])
-            voxel = find_voxel(x, y, z, cells)
-            if voxel < len(counts):
-                counts[voxel] += 1
+        for begin in range(0, points.shape[1], _BLOCK):
+            end = min(begin + _BLOCK, points.shape[1])
+            # Slices, because Numba looks for negative values of another index: not vectorised then.
+            xs, ys, zs = points[0, begin:end], points[1, begin:end], points[2, begin:end]
+            if cells.cylindrical:
+                for i in range(len(xs)):
+                    point = np.float64(xs[i]), np.float64(ys[i]), np.float64(zs[i])
+                    x, y, z = transform(pose, point[0], point[1], point[2])
+                    voxels[i] = find_voxel(x, y, z, cells)
+            else:
+                for i in range(len(xs)):
+                    point = np.float64(xs[i]), np.float64(ys[i]), np.float64(zs[i])
+                    x, y, z = transform(pose, point[0], point[1], point[2])
+                    voxels[i] = find_in_box(x, y, z, cells)
+            for voxel in voxels[: len(xs)]:
+                if voxel < len(counts):
+                    counts[voxel] += 1
 
 
 @cached

@@ -40,7 +40,6 @@ from carlasc.core.arrays import (
     LabelArray,
     Uint16Array,
 )
-from carlasc.core.cells import run_starts
 from carlasc.core.classes import ClassTable
 from carlasc.core.compiling import cached, inlined, jit
 from carlasc.core.grids import GridSpec
@@ -297,20 +296,20 @@ def agree(votes: AnyArray, spec: GridSpec, classes: ClassTable) -> ClassConsensu
         return ClassConsensus(labels, np.empty(0, dtype), 0.0)
     counted = np.bincount(votes["label"]) > 0
     present = np.flatnonzero(counted)
-    own = (np.cumsum(counted) - 1)[votes["label"]]
-    begins = np.append(run_starts(votes["voxel"]), len(votes))
-    voxels = votes["voxel"][begins[:-1]]
-    # dense, so that the compiled loops find a neighbour without a search
-    rows = np.full(spec.num_voxels, -1, np.int32)
-    rows[voxels] = np.arange(len(voxels))
-    # Errors of the points of one scan are correlated, so each scan has one vote, which is split
-    # among its classes.
-    scans = np.maximum.reduceat(votes["voters"], begins[:-1]) / np.add.reduceat(
-        votes["votes"], begins[:-1]
+    count = len(votes)
+    cast = _Cast(
+        np.empty(count, np.int32),
+        np.zeros(count + 1, np.int64),
+        np.empty(count, np.int64),
+        np.empty(count),
+        np.empty(count),
+        np.full(spec.num_voxels, -1, np.int32),
+        spec.size,
     )
-    weight = votes["sure"] * np.repeat(scans, np.diff(begins))
-    total = np.asarray(np.bincount(rows[votes["voxel"]], weight), np.float64)
-    cast = _Cast(voxels, begins, own, weight, total, rows, spec.size)
+    count = _split_votes(votes, np.cumsum(counted) - 1, cast)
+    cast = cast._replace(
+        voxels=cast.voxels[:count], begins=cast.begins[: count + 1], total=cast.total[:count]
+    )
 
     # The majority in voxels with many scans stands for the truth there, instead of the iterations
     # of Dawid and Skene. Classes without such voxels get the usual share of errors, spread evenly
@@ -330,22 +329,17 @@ def agree(votes: AnyArray, spec: GridSpec, classes: ClassTable) -> ClassConsensu
     # Voxels with enough votes for one class and none for others are decided here, without a search
     # of their neighbours.
     frequency /= frequency.sum()
-    first = begins[:-1]
-    plain = (np.diff(begins) == 1) & (weight[first] >= _needed(confusion, frequency)[own[first]])
+    first = cast.begins[:-1]
+    is_enough = cast.weight[first] >= _needed(confusion, frequency)[cast.own[first]]
+    plain = (np.diff(cast.begins) == 1) & is_enough
     place = np.where(plain, -1, np.cumsum(~plain) - 1)
     shares = np.empty((np.count_nonzero(~plain), len(present)), np.float32)
     _find_shares(cast, confusion, frequency, place, shares)
-    labels[voxels] = present[own[first]]
-    labels[voxels[~plain]] = present[shares.argmax(axis=1)]
-
     # Shares are rounded down, so that the sum of a voxel is at most 1.
-    row, column = np.nonzero(shares * layout.CERTAIN >= 1)
-    table = np.empty(len(row) + np.count_nonzero(plain), dtype)
-    table["voxel"] = np.concatenate([voxels[~plain][row], voxels[plain]])
-    table["label"] = np.concatenate([present[column], labels[voxels[plain]]])
-    table["votes"] = layout.CERTAIN
-    table["votes"][: len(row)] = shares[row, column] * layout.CERTAIN
-    return ClassConsensus(labels, table[np.argsort(table["voxel"], kind="stable")], wrong)
+    shares *= layout.CERTAIN
+    table = np.empty(np.count_nonzero(plain) + np.count_nonzero(shares >= 1), dtype)
+    _write_shares(cast, present, place, shares, labels, table)
+    return ClassConsensus(labels, table, wrong)
 
 
 def _needed(confusion: FloatArray, frequency: FloatArray) -> FloatArray:
@@ -360,6 +354,70 @@ def _needed(confusion: FloatArray, frequency: FloatArray) -> FloatArray:
         np.where(np.eye(len(gain), dtype=np.bool_), -np.inf, np.inf),
     )
     return np.asarray(needed.max(axis=0), np.float64)
+
+
+@cached
+def _split_votes(votes: AnyArray, numbers: IntArray, cast: _Cast) -> int:
+    """Write the votes by voxel, and return the number of voxels.
+
+    Args:
+        votes: (M,) as in `agree`.
+        numbers: index of each class.
+        cast: output; all `begins` are 0, and all `rows` -1.
+    """
+    voxels, begins, own, weight, total, rows, _ = cast
+    row, count = 0, 0
+    while row < len(votes):
+        begin, voxel, voters, points = row, votes[row].voxel, 0, 0
+        while row < len(votes) and votes[row].voxel == voxel:
+            voters, points = max(voters, votes[row].voters), points + votes[row].votes
+            row += 1
+        # Errors of the points of one scan are correlated, so each scan has one vote, which is split
+        # among its classes.
+        whole = 0.0
+        for k in range(begin, row):
+            own[k] = numbers[votes[k].label]
+            weight[k] = votes[k].sure * (voters / points)
+            whole += weight[k]
+        voxels[count], total[count], rows[voxel] = voxel, whole, count
+        count += 1
+        begins[count] = row
+    return count
+
+
+@cached
+def _write_shares(
+    cast: _Cast,
+    present: IntArray,
+    place: IntArray,
+    shares: Float32Array,
+    labels: LabelArray,
+    table: AnyArray,
+) -> None:
+    """Write the likeliest class of each voxel, and the table of shares.
+
+    Args:
+        cast: the votes.
+        present: (K,) the classes.
+        place: (N,) row of each voxel in `shares`; -1 if it has the class of its only row.
+        shares: (D, K) in the unit of the table.
+        labels: (V,) output.
+        table: output, with room for all shares of at least 1.
+    """
+    end = 0
+    for i in range(len(cast.voxels)):
+        voxel, likeliest = cast.voxels[i], cast.own[cast.begins[i]]
+        if place[i] >= 0:
+            likeliest = shares[place[i]].argmax()
+        labels[voxel] = present[likeliest]
+        for kind in range(len(present)):
+            share = np.float32(layout.CERTAIN) if kind == likeliest else np.float32(0)
+            if place[i] >= 0:
+                share = shares[place[i], kind]
+            if share >= 1:
+                table[end].voxel, table[end].label = voxel, present[kind]
+                table[end].votes = np.uint16(share)
+                end += 1
 
 
 @inlined

@@ -334,23 +334,24 @@ def count_hits(
         number: how many of them there were before.
     """
     view, voxels, begin = view_from(pose, cells), np.empty(BLOCK, np.int32), 0
-    xs, ys, zs = points[0], points[1], points[2]
     doubts, own = len(sure) > 0, np.uint16(voter)
-    while begin < len(xs):
-        # Places of a block first, in vectorised code.
-        size = min(BLOCK, len(xs) - begin)
+    while begin < points.shape[1]:
+        # Places of a block first, in vectorised code: from slices, as Numba would look for negative
+        # values of another index, and the processor would gather the numbers one by one.
+        end = min(begin + BLOCK, points.shape[1])
+        xs, ys, zs = points[0, begin:end], points[1, begin:end], points[2, begin:end]
         if view.cylindrical:
-            for i in range(size):
-                x, y, z = transform(view.pose, xs[begin + i], ys[begin + i], zs[begin + i])
+            for i in range(len(xs)):
+                x, y, z = transform(view.pose, xs[i], ys[i], zs[i])
                 voxels[i] = place_cylindrical(x, y, z, view)
         else:
-            for i in range(size):
-                x, y, z = transform(view.pose, xs[begin + i], ys[begin + i], zs[begin + i])
+            for i in range(len(xs)):
+                x, y, z = transform(view.pose, xs[i], ys[i], zs[i])
                 voxels[i] = place_cartesian(x, y, z, view)
-        for i in range(size):
+        for i in range(len(xs)):
             voxel = voxels[i]
             if voxel == DOUBTFUL:
-                x, y, z = transform(pose, xs[begin + i], ys[begin + i], zs[begin + i])
+                x, y, z = transform(pose, xs[i], ys[i], zs[i])
                 voxel = find_voxel(x, y, z, cells)
             if hits[voxel].votes == 0:
                 hit[number] = voxel
@@ -361,7 +362,7 @@ def count_hits(
             # The doubt is summed, not the certainty: it is 0 for labels without probabilities.
             if doubts:
                 doubt[voxel] += np.float32(1) - sure[begin + i]
-        begin += size
+        begin = end
     return number
 
 
