@@ -429,7 +429,7 @@ class FrameTask:
                 arrays, grid = self._read(self.existing)
                 outputs = Outputs()
             elif frame is not None:
-                arrays, grid = self._outputs_of(frame.make(plan), frame)
+                arrays, grid = self.outputs_of(frame.make(plan), frame)
                 outputs = arrays
             else:
                 raise MissingDataError(f"frame {number}", expected="in the source", found="none")
@@ -446,7 +446,7 @@ class FrameTask:
             return FrameResult(self, error=str(error))
         return FrameResult(self, outputs, facts=facts)
 
-    def _outputs_of(self, data: FrameData, frame: FrameInput) -> tuple[Outputs, Grid]:
+    def outputs_of(self, data: FrameData, frame: FrameInput) -> tuple[Outputs, Grid]:
         """Return all arrays to write for a frame, the grid last, and the grid.
 
         Raises:
