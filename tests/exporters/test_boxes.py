@@ -169,9 +169,12 @@ def test_boxes_of_a_table_have_scores_and_a_change_of_it_is_written(tmp_path):
     assert all(values[14] == 0.75 for _, values in first.values())
     box_table(DRIVE, scale=2.0).write(file)
     options = {"boxes": str(file)}
-    assert export(
-        "kitti-tracking", tmp_path / "in", tmp_path / "out", options=options, run=ONE
-    ).made
+    changed, same = (
+        export("kitti-tracking", tmp_path / "in", tmp_path / "out", options=options, run=ONE)
+        for _ in range(2)
+    )
+    assert changed.made and not changed.skipped
+    assert same.skipped and not same.made
     now = read_labels(labels)
     assert len(now) == len(table.times)
     assert now[0, 0][1][9] == pytest.approx(2 * first[0, 0][1][9], abs=1e-5)
