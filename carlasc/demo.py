@@ -96,7 +96,8 @@ def demonstrate(
     start = time.perf_counter()
     out = Path(out)
     step = step or _without_progress
-    train, val = out / TRAIN, out / VAL
+    train = out / TRAIN
+    val = out / VAL
     if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not train.is_dir())):
         raise ConflictError(
             out,

@@ -69,8 +69,11 @@ class CarlascError(Exception):
             # the only positional argument, so that errors can be pickled: other attributes are in
             # __dict__
         )
-        self.where, self.problem = shown, problem
-        self.expected, self.found, self.advice = expected, str(found), advice
+        self.where = shown
+        self.problem = problem
+        self.expected = expected
+        self.found = str(found)
+        self.advice = advice
 
     def __str__(self) -> str:
         where, problem, expected, found, advice = (
@@ -324,7 +327,8 @@ def install_command(extra: str) -> str:
     from importlib import metadata
     from urllib.parse import unquote, urlsplit
 
-    found, editable = "carlasc", ""
+    found = "carlasc"
+    editable = ""
     # not installed (only on the path), or not JSON
     with suppress(metadata.PackageNotFoundError, ValueError):
         # PEP 610

@@ -25,7 +25,15 @@ from carlasc.core.geometry import relative_to
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA, REMAPS
 from carlasc.groundtruth import Observation, count_votes
-from carlasc.viewing import ClassColors, Panel, Viewpoint, draw_panels, grid_drawing, render_grid
+from carlasc.viewing import (
+    ClassColors,
+    Look,
+    Panel,
+    Viewpoint,
+    draw_panels,
+    grid_drawing,
+    render_grid,
+)
 
 IMAGES = Path(__file__).parent / "images"
 SENSORS, FRAME = 20, 60
@@ -129,8 +137,10 @@ def draw_town() -> bytes:
     picture = render_grid(
         _ground_truth(spec),
         REMAPS["carlasc11"].target,
-        size=(1280, 720),
-        viewpoint=Viewpoint.parse("azimuth=28 elevation=35 distance=80 target=-2,0,-2.5"),
+        Look(
+            size=(1280, 720),
+            viewpoint=Viewpoint.parse("azimuth=28 elevation=35 distance=80 target=-2,0,-2.5"),
+        ),
     )
     return _png(picture)
 

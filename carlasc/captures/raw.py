@@ -263,7 +263,8 @@ class Capture:
             for kind in ("velocities", "pose")
             for sensor in self.sensors
         ]
-        files, by_actor = self.tree.read_many(paths), dict[int, FloatArray]()
+        files = self.tree.read_many(paths)
+        by_actor = dict[int, FloatArray]()
         half = len(self.sensors)
         for row, (path, data) in enumerate(zip(paths[:half], files[:half], strict=True)):
             rows = parse_npy(data, FORMATS["velocities"], where := self.tree.where(path))
@@ -464,7 +465,8 @@ class CaptureFiles(FrameFiles):
     kind = "capture"
 
     def __init__(self, capture: Capture) -> None:
-        self.capture, self.tree = capture, capture.tree
+        self.capture = capture
+        self.tree = capture.tree
 
     def paths(self, frame: int) -> list[str]:
         """Return the files of all sensors and cameras."""

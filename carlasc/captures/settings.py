@@ -84,7 +84,9 @@ class Lidar:
     scattered: bool = False
 
     def __post_init__(self) -> None:
-        each, low, high = self.channels, self.lower_deg, self.upper_deg
+        each = self.channels
+        low = self.lower_deg
+        high = self.upper_deg
         for valid, name, expected, found in (
             (each >= 1, "channels", "at least 1", each),
             (self.points >= each, "points", f"at least one per channel ({each})", self.points),
@@ -145,7 +147,8 @@ class Lidar:
         """Return the directions of the part of an additive sequence that belongs to a scan."""
         steps = np.arange(scan * self.points, (scan + 1) * self.points)
         turn, rise = (steps * step % 1.0 for step in _R2)
-        low, high = math.radians(self.lower_deg), math.radians(self.upper_deg)
+        low = math.radians(self.lower_deg)
+        high = math.radians(self.upper_deg)
         return _unit_vectors(low + (high - low) * rise, (2 * turn - 1) * np.pi)
 
 
@@ -268,10 +271,8 @@ def sensor_offsets(sensors: int, rng: np.random.Generator) -> FloatArray:
         (sensors, 3) float64 offsets in the vehicle frame, metres. The first is the constant offset
         of the ego sensor; the others are uniformly distributed in a box.
     """
-    low, high = (
-        (-MAX_OFFSET_M, -MAX_OFFSET_M, HEIGHTS_M[0]),
-        (MAX_OFFSET_M, MAX_OFFSET_M, HEIGHTS_M[1]),
-    )
+    low = (-MAX_OFFSET_M, -MAX_OFFSET_M, HEIGHTS_M[0])
+    high = (MAX_OFFSET_M, MAX_OFFSET_M, HEIGHTS_M[1])
     return np.vstack([EGO_SENSOR_M, rng.uniform(low, high, (sensors - 1, 3))])
 
 

@@ -86,8 +86,12 @@ class Simulator(Capture, ABC):
         check_choice("traffic", traffic, TrafficLevel)
         self.location = f"the simulated drive of seed {seed}"
         self.classes = CARLA
-        self._frames, self._sensors = range(first_frame, first_frame + count), sensors
-        self.seed, self.traffic, self.lidar, self.bev = seed, traffic, lidar or Lidar(), bev
+        self._frames = range(first_frame, first_frame + count)
+        self._sensors = sensors
+        self.seed = seed
+        self.traffic = traffic
+        self.lidar = lidar or Lidar()
+        self.bev = bev
         self.cameras = {camera.name: camera for camera in self.make_cameras(cameras)}
         if effects != LidarEffects() and type(self).read_scan is Capture.read_scan:
             raise ArgumentError("effects", expected="none: its scans are ideal", found=effects)

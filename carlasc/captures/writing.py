@@ -47,7 +47,8 @@ class CaptureWriter:
             **storage_options: options of fsspec for the URL.
         """
         folder = target_of(out, **storage_options)
-        self.out, self.target = folder.location, folder.below(RAW)
+        self.out = folder.location
+        self.target = folder.below(RAW)
         self.location = self.target.location
 
     def check_settings(self, file: str, settings: Mapping[str, Any], command: str) -> None:
@@ -239,7 +240,8 @@ class TimesLog:
 
         Only one process may do this at a time.
         """
-        self.writer, self.every = writer, every
+        self.writer = writer
+        self.every = every
         self._waiting: dict[int, Sequence[float]] = {}
 
     def add(self, frame: int, times_s: Sequence[float]) -> None:

@@ -28,9 +28,13 @@ if TYPE_CHECKING:
 _Number = TypeVar("_Number", int, float)
 _Row = TypeVar("_Row")
 
-MANY, WORST = 100, 10  # of more sequences or grids, sums and the worst are printed
+# of more sequences or grids, sums and the worst are printed
+MANY = 100
+WORST = 10
 _LINE_S = 10.0  # time between two lines of progress without a terminal, seconds
-FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
+FAILED = 1
+WRONG_USAGE = 2
+INTERRUPTED = 130
 
 OPTIONS: ContextVar[Mapping[str, str]] = ContextVar("OPTIONS", default=MappingProxyType({}))
 """What a user types for each argument of the library that is an option of the running command."""
@@ -193,7 +197,8 @@ def as_typed(text: str) -> str:
     options = OPTIONS.get()
 
     def replace(match: re.Match[str]) -> str:
-        name, value = match[1], match[2]
+        name = match[1]
+        value = match[2]
         if name not in options:
             return match[0]
         if value in ("True", None):

@@ -142,15 +142,10 @@ def convert(
     Run it again to continue where it stopped: frames that exist are skipped.
     """
     chosen = None if sequences is None else sequences.split(",")
+    common = {"layout": layout.make(), "poses": poses.make(), "options": options.values}
     if dry_run:
         previews = carlasc.converting.preview(
-            name,
-            source,
-            sequences=chosen,
-            **written.values,
-            layout=layout.make(),
-            poses=poses.make(),
-            options=options.values,
+            name, source, sequences=chosen, **written.values, **common
         )
         if json:
             print_json(previews)
@@ -197,10 +192,8 @@ def convert(
             source,
             out,
             idle_s=idle,
-            layout=layout.make(),
-            poses=poses.make(),
             grids=made if grids == "scans" else None,
-            options=options.values,
+            **common,
             say=lambda line: echo(line, err=True),
         )
     with run.spread(f"convert {name}", "steps") as spread:
@@ -209,10 +202,8 @@ def convert(
             source,
             out,
             sequences=chosen,
-            layout=layout.make(),
-            poses=poses.make(),
             grids=made if grids == "scans" else "voxels" if grids == "voxels" else None,
-            options=options.values,
+            **common,
             run=spread,
         )
     if not json:

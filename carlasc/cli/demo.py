@@ -63,7 +63,8 @@ def _show_step(name: str) -> Iterator[Callable[[int, int], None]]:
 
     On a terminal, also show its progress.
     """
-    start, has_bar = time.perf_counter(), sys.stderr.isatty()
+    start = time.perf_counter()
+    has_bar = sys.stderr.isatty()
     if not has_bar:  # a bar would be drawn over an unfinished line
         echo(f"{name} ...", nl=False)
         sys.stdout.flush()

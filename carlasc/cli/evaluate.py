@@ -172,7 +172,8 @@ def evaluate(
         from carlasc.inspection.charts import check_plot
 
         check_plot(output.plot)  # before anything is counted
-    name, common = name or Path(source).name, dict(choice.values)
+    name = name or Path(source).name
+    common = dict(choice.values)
     if boxes or forecast is not None:
         others = {
             "all_conventions": all_conventions,
@@ -340,7 +341,8 @@ def _print_conventions(results: Mapping[str, Any], as_json: bool) -> None:
             }
         )
     else:
-        rows, reasons = list[list[object]](), []
+        rows = list[list[object]]()
+        reasons = []
         for name, result in results.items():
             if isinstance(result, CarlascError):
                 rows.append([name, *"-----"])

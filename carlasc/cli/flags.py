@@ -114,7 +114,8 @@ def flatten(
     def command(**given: Any) -> None:
         function(**{name: group.take(given) for name, group in groups.items()}, **given)
 
-    command.__name__, command.__doc__ = function.__name__, function.__doc__
+    command.__name__ = function.__name__
+    command.__doc__ = function.__doc__
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return command

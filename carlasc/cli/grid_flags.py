@@ -18,8 +18,8 @@ from carlasc.errors import ArgumentError, count
 
 _FEW = 8  # fewer voxels along an axis are unusual
 _MOVED_M = 1e-3  # bounds that differ by less are equal up to rounding
-# fact: large-frame
-_VOXEL_BYTES, _LARGE_BYTES = 8, 2e9  # size of a label and a count; a larger frame is unusual
+_VOXEL_BYTES = 8  # size of a label and a count
+_LARGE_BYTES = 2e9  # a larger frame is unusual; fact: large-frame
 
 MotionGiven = Annotated[Given, Library("carlasc.motion.MotionOptions")]
 PosesGiven = Annotated[Given, Library("carlasc.motion.PoseOptions")]

@@ -50,7 +50,8 @@ def _print(overview: Overview, *, everything: bool) -> None:
         line(overview.location, "bold") + line(f": {overview.level} ({overview.store})")
     )
     if overview.places:
-        frames, taken = overview.total("frames"), overview.total("bytes")
+        frames = overview.total("frames")
+        taken = overview.total("bytes")
         show(f"{count(sum(overview.places.values()), 'sequence')}{splits}")
         size = f"{_size(taken.value)} ({_size(taken.low)} to {_size(taken.high)})"
         looked_at = f"{len(overview.sequences)} looked at (--all: all)"

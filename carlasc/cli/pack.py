@@ -42,7 +42,8 @@ def _print(result: carlasc.storage.packing.PackResult) -> None:
     echo(
         f"{result.out}: {count(len(result.sequences), 'sequence')}, {count(result.frames, 'frame')}"
     )
-    published, stored = result.published_bytes, result.stored_bytes
+    published = result.published_bytes
+    stored = result.stored_bytes
     rows = [
         (name, published.get(name, 0), stored.get(name, 0))
         for name in sorted({*published, *stored})

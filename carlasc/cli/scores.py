@@ -39,7 +39,10 @@ def scores(
         figures = table.table()
         print_table(figures.header, figures.texts(), title=figures.title)
         return
-    text = getattr(table, f"to_{'csv' if format == 'text' else format}")()
+    if format == "html":
+        text = table.to_html()
+    else:
+        text = getattr(table.table(), f"to_{'csv' if format == 'text' else format}")()
     if out is None:
         echo(text, nl=False)
         return

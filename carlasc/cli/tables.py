@@ -46,7 +46,8 @@ def print_table(
         console: where to print, as wide as the terminal; None for stdout.
     """
     console = console or stdout()
-    title, header = printable(title), [printable(name) for name in header]
+    title = printable(title)
+    header = [printable(name) for name in header]
     texts = [list(map(_text, row)) for row in rows]
     columns: list[Column] = list(zip(header, *texts, strict=True))
     if (
@@ -82,7 +83,8 @@ def _text(cell: object) -> str:
 
 def _split(columns: list[Column], width: int) -> Iterator[list[Column]]:
     """Yield as many columns at a time as fit beside the first one, and at least one."""
-    first, rest = columns[0], columns[1:]
+    first = columns[0]
+    rest = columns[1:]
     while rest:
         count = 1
         while count < len(rest) and _least_width([first, *rest[: count + 1]]) <= width:

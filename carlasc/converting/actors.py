@@ -151,7 +151,8 @@ class _ObservationChain:
 
 def _velocities_of(chain: _ObservationChain, classes: ClassTable) -> list[Velocity]:
     """Return the velocity in each frame of a chain, in the sensor frame of that frame."""
-    poses, seconds = np.stack(chain.poses), np.array(chain.seconds)
+    poses = np.stack(chain.poses)
+    seconds = np.array(chain.seconds)
     observations = [
         transform_points(pose, points) for pose, points in zip(poses, chain.points, strict=True)
     ]
@@ -174,7 +175,8 @@ class ActorMotion:
     """
 
     def __init__(self, classes: ClassTable, run: Run) -> None:
-        self._classes, self._run_options = classes, run
+        self._classes = classes
+        self._run_options = run
         self._chains: dict[int, _ObservationChain] = {}
         self._ended: list[_ObservationChain] = []
         self._velocities: dict[int, dict[int, Velocity]] = {}
@@ -287,7 +289,8 @@ class MotionStage:
         """Return the existing fields of a frame as they were written; labels only if they are from
         the data set.
         """
-        number, writer = job.handle.number, self.writer
+        number = job.handle.number
+        writer = self.writer
         wanted = [
             name
             for name in names
@@ -322,10 +325,8 @@ class MotionStage:
 
         Labels and instances of the data set are kept.
         """
-        written, classes = (
-            self._read_back(job, "points", "labels", "instances"),
-            self.target.classes,
-        )
+        written = self._read_back(job, "points", "labels", "instances")
+        classes = self.target.classes
         labels = written.get("labels")
         scan = Scan(np.ascontiguousarray(self._turned(written["points"])[:, :3]), labels)
         segments = segment_by_boxes(

@@ -237,10 +237,8 @@ def read_scan(handle: FrameHandle, rig: Rig, motion: VehicleMotion | None) -> As
     except (CarlascError, OSError, MemoryError):
         raise
     except Exception as error:
-        problem, advice = (
-            f"the converter failed: {describe(error)}",
-            "check the file, or report the error",
-        )
+        problem = f"the converter failed: {describe(error)}"
+        advice = "check the file, or report the error"
         raise FormatError(handle.location, problem=problem, advice=advice) from error
     scan = assemble(clouds, rig, motion, handle.location)
     if rig.rays:

@@ -32,12 +32,14 @@ class ChosenFrames(Recording):
         *,
         vehicle_is_level: bool = False,
     ) -> None:
-        self._own, self.frames = own, frames
+        self._own = own
+        self.frames = frames
         self._turn = None if vehicle_is_level else level_T_scan
         self.name = own.name
         self.split = own.split
         self.location = own.location
-        self.has_labels, self.has_instances = own.has_labels, own.has_instances
+        self.has_labels = own.has_labels
+        self.has_instances = own.has_instances
         self.voxels = own.voxels
         self.rays = own.rays
         self.sensors = own.sensors
@@ -78,7 +80,8 @@ class ChosenFrames(Recording):
 
     def cameras(self) -> Sequence[CameraModel]:
         """Return the cameras in the frame of the turned vehicle."""
-        turn, cameras = self._turn, self._own.cameras()
+        turn = self._turn
+        cameras = self._own.cameras()
         if turn is None:
             return cameras
         return [
@@ -91,7 +94,8 @@ class ChosenFrames(Recording):
 
     def problems(self) -> list[tuple[int, str]]:
         """Return the missing frames among the chosen ones."""
-        first, last = self.frames[0].number, self.frames[-1].number
+        first = self.frames[0].number
+        last = self.frames[-1].number
         return [one for one in self._own.problems() if first <= one[0] <= last]
 
     def notes(self) -> list[str]:

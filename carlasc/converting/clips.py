@@ -94,7 +94,8 @@ class Clips:
         looked at when its turn comes: the first one need not wait for requests about all others.
         """
         for name in self.names:
-            done, states[name] = sink.target.read(self._done(name)), self._state(name)
+            done = sink.target.read(self._done(name))
+            states[name] = self._state(name)
             if done is None or states[name].encode() not in done:
                 yield name
 

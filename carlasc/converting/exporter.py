@@ -108,6 +108,10 @@ class Exporter(ABC):
         """Return the sorted numbers of the frames to export."""
         return sequence.scan_frames().tolist()
 
+    @abstractmethod
+    def frame_files(self, sequence: storage.Sequence, frame: int) -> tuple[str, ...]:
+        """Return the paths of the files with a frame, in the sequence's folder."""
+
     def documents(self, sequence: storage.Sequence) -> Files:
         """Return the files of a sequence that belong to no single frame, by their path in its
         folder.
@@ -130,12 +134,8 @@ class FrameExporter(Exporter):
     """Writes one or more files per frame. Frames are made and written in parallel."""
 
     @abstractmethod
-    def frame_files(self, sequence: storage.Sequence, frame: int) -> tuple[str, ...]:
-        """Return the paths of the files that `make_frame` returns."""
-
-    @abstractmethod
     def make_frame(self, sequence: storage.Sequence, frame: int) -> Files:
-        """Return a frame's files, by their path in the sequence's folder.
+        """Return the contents of `frame_files`, by their path.
 
         Raises:
             CarlascError: the frame cannot be read, or cannot be expressed in the other format.
@@ -164,6 +164,10 @@ class SequenceExporter(Exporter):
     @abstractmethod
     def file(self, sequence: storage.Sequence) -> str:
         """Return the path of the sequence's file in its folder."""
+
+    def frame_files(self, sequence: storage.Sequence, frame: int) -> tuple[str, ...]:
+        """Return the file of the sequence."""
+        return (self.file(sequence),)
 
     @abstractmethod
     def frames_in(self, path: Path, sequence: storage.Sequence) -> Collection[int]:
@@ -222,10 +226,10 @@ class WholeFileExporter(SequenceExporter):
         return dict.fromkeys(names, ".")
 
     def frames_in(self, path: Path, sequence: storage.Sequence) -> Collection[int]:
-        """Return all frames, as files are written as a whole; `export` writes them always again,
-        because they may depend on other files than the sequence.
+        """Return all frames if the file has the content that would be written now: it may depend on
+        other files than the sequence.
         """
-        return self.frames(sequence)
+        return self.frames(sequence) if path.read_bytes() == self.encode(sequence)[0] else ()
 
     def open(self, path: Path, sequence: storage.Sequence) -> SequenceFile:
         """Write the file."""

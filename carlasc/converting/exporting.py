@@ -19,7 +19,6 @@ from carlasc.converting.exporter import (
     FrameExporter,
     SequenceExporter,
     SequenceFile,
-    WholeFileExporter,
 )
 from carlasc.converting.protocol import Failure, check_outside
 from carlasc.converting.registry import load_exporter, read_options
@@ -158,7 +157,8 @@ def export(
     wanted = _choose(every, names, sequences, opened.location)
     if exporter.of_one is not None:
         only(exporter.of_one, {sequence.name: sequence for sequence in wanted}, ONE_FRAME)
-    chosen, notes = [], []
+    chosen = []
+    notes = []
     for sequence in wanted:
         notes += exporter.check(sequence)
         chosen.append(_exported(exporter, sequence, folders))
@@ -310,18 +310,12 @@ def _is_whole(exporter: Exporter, exported: Exported, folder: Path) -> bool:
     if isinstance(exporter, SequenceExporter):
         path = folder / exporter.file(sequence)
         return has_content(path) and set(exported.frames) <= set(exporter.frames_in(path, sequence))
-    assert isinstance(exporter, FrameExporter)
     return all(_exists(exporter, sequence, frame, folder) for frame in exported.frames)
 
 
 def _exists(exporter: Exporter, sequence: storage.Sequence, frame: int, folder: Path) -> bool:
     """Whether all files of a frame exist, or the file of its sequence."""
-    files: Iterable[str] = ()
-    if isinstance(exporter, FrameExporter):
-        files = exporter.frame_files(sequence, frame)
-    elif isinstance(exporter, SequenceExporter):
-        files = (exporter.file(sequence),)
-    return all(has_content(folder / file) for file in files)
+    return all(has_content(folder / file) for file in exporter.frame_files(sequence, frame))
 
 
 _UNKNOWN = (
@@ -366,11 +360,14 @@ class _ExportedFrom:
         compare: CompareInputs,
         run: Run,
     ) -> None:
-        self._exporter, self._sequence = exporter, exported.sequence
-        self._folder, self._writer = root / exported.folder, _RootFiles(root)
+        self._exporter = exporter
+        self._sequence = exported.sequence
+        self._folder = root / exported.folder
+        self._writer = _RootFiles(root)
         self._label = f"{label}-{run.part.number}-of-{run.part.count}"
         self._before = self._now = MadeFrom.read(self._writer, self._label)
-        self.is_known, self.changed = bool(self._before.whole), False
+        self.is_known = bool(self._before.whole)
+        self.changed = False
         if compare != "never":
             sequence = self._sequence
             files = SequenceFiles(sequence, *sequence.fields())
@@ -459,7 +456,8 @@ class _SequenceExport:
     def add(self, exported: Exported, *, again: bool = False) -> None:
         """Export the frames of a sequence; with `again`, also those that exist."""
         self._again = again or self.overwrite
-        sequence, folder = exported.sequence, self.root / exported.folder
+        sequence = exported.sequence
+        folder = self.root / exported.folder
         remove_stale(folder)
         documents = self.exporter.documents(sequence)
         write_many({folder / document: data for document, data in documents.items()})
@@ -476,7 +474,8 @@ class _SequenceExport:
         """Write the missing frames of a sequence, each in its own files; return the messages of
         those that failed.
         """
-        exporter, sequence = self.exporter, exported.sequence
+        exporter = self.exporter
+        sequence = exported.sequence
         assert isinstance(exporter, FrameExporter)
         jobs = [
             ExportJob(exporter, sequence, frame, folder)
@@ -498,10 +497,10 @@ class _SequenceExport:
 
         A file that lacks frames is written again.
         """
-        exporter, sequence = self.exporter, exported.sequence
+        exporter = self.exporter
+        sequence = exported.sequence
         assert isinstance(exporter, SequenceExporter)
-        again = self._again or isinstance(exporter, WholeFileExporter)
-        if not again and _is_whole(exporter, exported, folder):
+        if not self._again and _is_whole(exporter, exported, folder):
             self._skip(len(exported.frames))
             return {}
         path = folder / exporter.file(sequence)
@@ -577,7 +576,9 @@ class ExportRecord:
     """
 
     def __init__(self, root: Path, name: str, product: str) -> None:
-        self._path, self._name, self._product = root / RECORD, name, product
+        self._path = root / RECORD
+        self._name = name
+        self._product = product
 
     def _read(self) -> dict[str, Any]:
         path = self._path

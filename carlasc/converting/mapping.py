@@ -180,7 +180,8 @@ def map(
     wanted = FrameRange.of(frames)
     keep = recording.keep
     options = recording.options
-    root, reader = None, None
+    root = None
+    reader = None
     if (
         isinstance(source, Source)
         or (reader := recording.converter or _reader_of(source, grid)) is None
@@ -208,7 +209,8 @@ def map(
     first = files.all[0]
     settings = (cell_m, str(wanted), grid, [str(path) for path in files.all])
     record = MadeFrom(combined(settings, motion, poses, keep_parked, sorted(states.items())))
-    keeper, kept = FolderWriter(first.parent), f"map-{first.name}"
+    keeper = FolderWriter(first.parent)
+    kept = f"map-{first.name}"
     is_ours = MadeFrom.read(keeper, kept) == record
     place = first.parent / layout.DERIVED
     place /= f"recording-{first.name}"
@@ -222,7 +224,8 @@ def map(
     if not overwrite:  # so that the next run continues one that is killed
         files = replace(files, begin=lambda: record.write(keeper, kept))
 
-    made, steps = None, StepCounter(run.progress)
+    made = None
+    steps = StepCounter(run.progress)
     if root is not None and reader is not None:
         check_outside(first, str(root))
         made = convert(

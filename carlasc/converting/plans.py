@@ -64,7 +64,8 @@ from carlasc.storage.resuming import agree_lines, agree_metadata, check_grid, re
 if TYPE_CHECKING:
     from carlasc.motion.odometry import UsableScan
 
-FILE, KISS_ICP = "file", "kiss-icp"
+FILE = "file"
+KISS_ICP = "kiss-icp"
 CONVERSION = "conversion"
 """Name of the record of what the scans of an output were converted from."""
 _ESTIMATE = 'estimate poses from the scans with `poses="kiss-icp"`'
@@ -142,7 +143,9 @@ class RecordingPlan(Examined):
         """Make all frames again, because the data set changed."""
         numbers = set(self.recording.frame_numbers)
         self.is_same = is_same
-        self.again, self.missing, self.unfinished = True, numbers, set(numbers)
+        self.again = True
+        self.missing = numbers
+        self.unfinished = set(numbers)
 
     def take_estimate(self, first_T_scan: FloatArray) -> None:
         """Take estimated poses, (F, 4, 4) by frame number."""
@@ -311,7 +314,8 @@ def examine(
         FormatError: poses or times are not valid, or belong to other times than the scans.
         MissingDataError: the recording has no poses, although they were requested.
     """
-    notes, findings = list[str | None](), list[Finding]()
+    notes = list[str | None]()
+    findings = list[Finding]()
     checked = recording.rays and (level or not known)
     mount = find_mount([*_some_scans(recording).values()]) if checked else None
     if not level:
@@ -354,7 +358,8 @@ def examine(
             )
     if len(chosen) < len(recording.frames):
         recording = ChosenFrames(recording, chosen)
-    poses, last = None, chosen[-1].number + 1
+    poses = None
+    last = chosen[-1].number + 1
     if trajectory is not None:
         poses = scan_poses(trajectory, recording, times)[:last]
         if trajectory.seconds is None:
@@ -377,12 +382,14 @@ def examine(
                     other = scan_poses(swapped, recording, times)[:last]
                     notes.append(check_poses(recording, converter, other))
                     notes.append(f"quaternions in {swapped.where} are w, x, y, z: scans overlap so")
-                    trajectory, poses = swapped, other
+                    trajectory = swapped
+                    poses = other
                 except FormatError:
                     findings.append(Finding.from_error("poses-on-scans", recording.location, error))
         numbers = np.array([handle.number for handle in chosen])
         if jump := describe_jumps(numbers, poses[numbers], times[numbers]):
-            where, expected = recording.location, "poses without jumps"
+            where = recording.location
+            expected = "poses without jumps"
             advice = f"check whether the poses belong to these scans, or {_ESTIMATE}"
             findings.append(Finding("warning", "pose-jump", where, expected, jump, advice))
         notes.append(jitter_note(poses))
@@ -428,11 +435,13 @@ def _upright(
     Its poses are those of the tilted sensor, or of a vehicle that is level, whatever lets scans
     overlap more.
     """
-    frames, turn = recording.frames, mount.level_T_scan
+    frames = recording.frames
+    turn = mount.level_T_scan
     choices = [
         ChosenFrames(recording, frames, turn, vehicle_is_level=level) for level in (False, True)
     ]
-    times, shares = frame_times(recording, recording.times()), list[float]()
+    times = frame_times(recording, recording.times())
+    shares = list[float]()
     for choice in choices:
         trajectory = read_trajectory(choice, options)
         if trajectory is None:
@@ -519,7 +528,8 @@ def _read_boxes(recording: Recording, target: AxesAndClasses) -> dict[int, Boxes
     boxes = recording.boxes()
     if boxes is None:
         return None
-    last, read = recording.frames[-1].number, dict[int, Boxes]()
+    last = recording.frames[-1].number
+    read = dict[int, Boxes]()
     scan_T_vehicle = invert(recording.vehicle_T_scan)
     moved = not np.array_equal(scan_T_vehicle, np.eye(4))
     for number, own in boxes.items():
@@ -563,7 +573,8 @@ def _announce(plan: RecordingPlan) -> None:
     """Declare the scans and their sizes, for stores that need this before anything is written."""
     if plan.writer.block == 1:
         return
-    frames, points = plan.recording.frames, list[int]()
+    frames = plan.recording.frames
+    points = list[int]()
     for handle in {frames[i].number: frames[i] for i in (0, len(frames) // 2, -1)}.values():
         with suppress(CarlascError):  # the error is reported when the frame is read again
             points.append(sum(len(cloud.points) for cloud in handle.read()))
@@ -842,7 +853,8 @@ def _read_usable(handle: FrameHandle, rig: Rig) -> UsableScan | CarlascError | O
         scan = read_scan(handle, rig, None)
     except (CarlascError, OSError) as error:
         return error
-    used, seconds = usable_points(scan.points), scan.fields.get("seconds")
+    used = usable_points(scan.points)
+    seconds = scan.fields.get("seconds")
     return scan.points[used, :3], None if seconds is None else seconds[used]
 
 
@@ -908,7 +920,8 @@ def follow(
 
     numbers: list[int] = []
     read_at: list[float] = []
-    centres, poses = ScanCentres(), list[FloatArray]()
+    centres = ScanCentres()
+    poses = list[FloatArray]()
 
     def usable() -> Iterator[UsableScan]:
         for number, scan in scans:

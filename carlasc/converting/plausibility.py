@@ -22,7 +22,8 @@ from carlasc.motion.ground import ground_plane
 _ENOUGH = 30000  # points of a scan in which the ground is looked for
 _SAMPLE = 4000  # points of a scan that say how far away they are
 # no LiDAR on a carrier sees half of its points, or all of them, so far away
-_FARTHEST_M, _ALL_FAR_M = 2000.0, 250.0
+_FARTHEST_M = 2000.0
+_ALL_FAR_M = 250.0
 _LONGEST_S = 3.0  # points are taken within this time of their frame; fact: longest-frame
 
 POSE_S = 0.25  # fact: pose-reach
@@ -32,14 +33,22 @@ _USUAL_GAPS = 5.0  # or over so many usual intervals
 
 # Up in the axes of the sensor, the most likely first, and the axes that it belongs to.
 _UPS = (("+z", "flu"), ("-z", "frd"), ("-y", "rdf"), ("+y", "rub"), ("+x", "ulb"), ("-x", "dlf"))
-_LEVEL, _STEEP = 0.25, 0.8  # slopes of the ground of an upright sensor, and of a tilted one
+# slopes of the ground of an upright sensor, and of a tilted one
+_LEVEL = 0.25
+_STEEP = 0.8
 _LEAST_M = 0.2  # ground must be at least this far below the sensor
 # Ground in an unusual direction reaches beyond this distance, in this share of all directions, and
 # at most this share of the near points is below it: so do no walls and ceilings.
-_WIDE_M, _WIDE = 8.0, 0.3
-_NEAR_M, _BELOW_M, _BELOW = 15.0, 0.5, 0.02
-_SECTORS, _ON_GROUND_M = 36, 0.1
-_TILTED, _FALLEN = 5.0, 14.0  # degrees: grids, and the ground below the sensor, need less
+_WIDE_M = 8.0
+_WIDE = 0.3
+_NEAR_M = 15.0
+_BELOW_M = 0.5
+_BELOW = 0.02
+_SECTORS = 36
+_ON_GROUND_M = 0.1
+# degrees: grids, and the ground below the sensor, need less
+_TILTED = 5.0
+_FALLEN = 14.0
 
 
 def check_scan(points: Float32Array, seconds: AnyFloatArray | None, where: str) -> None:
@@ -69,7 +78,8 @@ def check_scan(points: Float32Array, seconds: AnyFloatArray | None, where: str) 
                 "them by the inverse of the pose of each scan",
             )
     if seconds is not None and len(seconds):
-        first, last = float(seconds.min()), float(seconds.max())
+        first = float(seconds.min())
+        last = float(seconds.max())
         if first < -_LONGEST_S or last > _LONGEST_S:
             raise FormatError(
                 f"{where}: times of points",

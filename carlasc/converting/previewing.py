@@ -118,7 +118,8 @@ def preview(
 
 
 def _preview(seen: Examined) -> RecordingPreview:
-    recording, scan = seen.recording, _first_scan(seen.recording)
+    recording = seen.recording
+    scan = _first_scan(seen.recording)
     mount = seen.mount or find_mount([scan.points])
     steps = np.diff(seen.times[recording.frame_numbers])
     timed = seen.has_times and len(steps) and np.median(steps) > 0
@@ -148,7 +149,8 @@ def _preview(seen: Examined) -> RecordingPreview:
 
 def _first_scan(recording: Recording) -> Assembled:
     """Return the first scan that can be read; the error of the first one if there is none."""
-    rig, problem = Rig.of(recording), None
+    rig = Rig.of(recording)
+    problem = None
     for handle in recording.frames:
         try:
             return read_scan(handle, rig, None)

@@ -201,8 +201,10 @@ def option_declarations(kind: type[Converter] | type[Exporter]) -> tuple[OptionD
         DependencyError: annotations cannot be read, a parameter has no default, or its type is not
             str, int, float, bool or a Literal of texts.
     """
+    # fields that a dataclass inherits have the names of another module in their annotations
+    declared = kind if "__dataclass_fields__" in vars(kind) else kind.__init__
     try:
-        hints = get_type_hints(kind.__init__, include_extras=True)
+        hints = get_type_hints(declared, include_extras=True)
     except Exception as error:  # annotations of another distribution may name anything
         raise DependencyError(
             f"{kind.__name__}: options", problem=f"annotations cannot be read: {error}"

@@ -48,27 +48,24 @@ class TargetFrame:
     def spec_in(self, spec: GridSpec, axes: Axes) -> GridSpec:
         """Return the geometry of a grid of the layout in this frame."""
         right = spec if axes == "right" else mirror_spec(spec)
-        (x0, y0, z0) = right.lower
-        (x1, y1, z1) = right.upper
-        (nx, ny, nz) = right.size
-        z0, z1 = z0 + self.height_m, z1 + self.height_m
-        if self.forward == "x":
-            return GridSpec("cartesian", (nx, ny, nz), (x0, y0, z0), (x1, y1, z1))
-        return GridSpec("cartesian", (ny, nx, nz), (-y1, x0, z0), (-y0, x1, z1))
+        return self._moved(right, self.height_m, quarters=1)
 
     def spec_from(self, spec: GridSpec, axes: Axes) -> GridSpec:
         """Return the grid of the layout that has a geometry in this frame: the inverse of
         `spec_in`.
         """
-        (x0, y0, z0) = spec.lower
-        (x1, y1, z1) = spec.upper
-        (nx, ny, nz) = spec.size
-        z0, z1 = z0 - self.height_m, z1 - self.height_m
-        if self.forward == "x":
-            right = GridSpec("cartesian", (nx, ny, nz), (x0, y0, z0), (x1, y1, z1))
-        else:
-            right = GridSpec("cartesian", (ny, nx, nz), (y0, -x1, z0), (y1, -x0, z1))
+        right = self._moved(spec, -self.height_m, quarters=3)
         return right if axes == "right" else mirror_spec(right)
+
+    def _moved(self, spec: GridSpec, up_m: float, quarters: int) -> GridSpec:
+        """Return a geometry moved up and, where y points forward, turned by quarters of a turn."""
+        x0, y0, z0 = spec.lower
+        x1, y1, z1 = spec.upper
+        nx, ny, nz = spec.size
+        for _ in range(quarters if self.forward == "y" else 0):
+            nx, ny = ny, nx
+            x0, x1, y0, y1 = -y1, -y0, x0, x1
+        return GridSpec("cartesian", (nx, ny, nz), (x0, y0, z0 + up_m), (x1, y1, z1 + up_m))
 
 
 def is_same(one: GridSpec, other: GridSpec) -> bool:

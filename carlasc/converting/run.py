@@ -168,7 +168,8 @@ def convert(
         return _joined(results, time.perf_counter() - start)
     root = Path(source)
     converter = open_converter(name, root, options)
-    target, sink = layout.of(converter), as_sink(out, part=run.part)
+    target = layout.of(converter)
+    sink = as_sink(out, part=run.part)
     check_shared(sink.location, run)
     check_arguments(root, sink, split, grids)
     compare = layout.compare_inputs
@@ -179,7 +180,8 @@ def convert(
     recordings = _deal(every, run.part)
     if isinstance(grids, GridOptions):
         _check_rays(recordings)
-    has_voxels, chosen = isinstance(grids, str), FrameRange.of(frames)
+    has_voxels = isinstance(grids, str)
+    chosen = FrameRange.of(frames)
     plans = []
     for one in recordings:  # in Python 3.11, a comprehension is a level of calls
         planned = plan_recording(
@@ -299,7 +301,8 @@ class _ConvertedFrom:
         """Compare the files with those that an earlier output was made from; if they differ, all
         frames are made again.
         """
-        plan, states = self.plan, self.states
+        plan = self.plan
+        states = self.states
         self._before = before = MadeFrom.read(plan.writer, CONVERSION)
         if is_provisional(plan.writer):
             plan.make_again(is_same=True)
@@ -317,7 +320,8 @@ class _ConvertedFrom:
     def finish(self, conversion: Conversion) -> None:
         """Write the record, after the frames were written."""
         if self.plan.again:
-            before, where = self._before, self.plan.writer.location
+            before = self._before
+            where = self.plan.writer.location
             conversion.remove_others(map(int, before.frames))
             if before.whole == PROVISIONAL:
                 why = "they were provisional"
@@ -366,7 +370,8 @@ class _ConvertedScans(Source):
     """The sequences that some conversions wrote to a sink."""
 
     def __init__(self, sink: Sink, conversions: Series[Conversion]) -> None:
-        self.location, self._source = sink.location, sink.source()
+        self.location = sink.location
+        self._source = sink.source()
         self._chosen = {sequence_path(one.plan.recording): one for one in conversions}
 
     def sequences(self) -> dict[str, Sequence]:
@@ -386,10 +391,12 @@ def plan_grids(
     All grids have the same bounds, so that they can be in one training set: the bounds of the
     options, fitted to the ground and to the reach of points if `follow_ground` is set.
     """
-    spec, notes = grids.spec or GridSpec.published(), list[str]()
+    spec = grids.spec or GridSpec.published()
+    notes = list[str]()
     if grids.follow_ground:
         reach_m = max(one.reach_m for one in conversions)
-        whole, spec = spec, fit_to_reach(spec, reach_m)
+        whole = spec
+        spec = fit_to_reach(spec, reach_m)
         grounds = [one.ground for one in conversions if one.ground is not None]
         spec, notes = _fit(spec, grounds, scans.location)
         if spec.upper[0] != whole.upper[0]:

@@ -175,7 +175,8 @@ class ScanStage:
             self.writer.write_document(f"{VOXEL_FILES}/{name}", data)
         counts = known.astype(np.float32)
         if self.target.mirrored:
-            labels, counts = mirror_grid(labels), mirror_grid(counts)
+            labels = mirror_grid(labels)
+            counts = mirror_grid(counts)
         return {f"{grid}/labels": labels, f"{grid}/counts": counts}
 
 
@@ -428,7 +429,8 @@ class Conversion:
         def scans() -> Iterator[tuple[int, UsableScan]]:
             for result in usable:
                 if result.points is not None:
-                    points, result.points = result.points, None
+                    points = result.points
+                    result.points = None
                     waiting[result.number] = result
                     yield result.number, (points, None)
 
@@ -575,7 +577,8 @@ class Conversion:
         """Find the ground in some of the scans; write the height of the sensor if the data set
         does not say it, and what was found.
         """
-        plan, frames = self.plan, self.plan.recording.frame_numbers
+        plan = self.plan
+        frames = self.plan.recording.frame_numbers
         chosen = {frames[i] for i in np.linspace(0, len(frames) - 1, _GROUND_FRAMES).astype(int)}
         scans = [
             points
@@ -674,7 +677,8 @@ def _copy_images(plan: RecordingPlan, cameras: Sequence[CameraModel]) -> list[st
     """Copy the images of all frames, those that are stored together at once; return the number of
     missing images.
     """
-    missing, blocks = 0, dict[int, list[int]]()
+    missing = 0
+    blocks = dict[int, list[int]]()
     for handle in plan.recording.frames:
         blocks.setdefault(handle.number // plan.writer.block, []).append(handle.number)
     for numbers in blocks.values():

@@ -36,11 +36,9 @@ BOXES_DTYPE = np.dtype(
 )
 """One row per box, as in the files of the layout. See `Boxes` for the meaning of the columns."""
 
-_CENTER, _QUATERNION, _SIZE = (
-    ("x", "y", "z"),
-    ("qw", "qx", "qy", "qz"),
-    ("length", "width", "height"),
-)
+_CENTER = ("x", "y", "z")
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_SIZE = ("length", "width", "height")
 _UNIT_TOLERANCE = (
     1e-3  # greatest deviation of a quaternion's norm from 1, as for the rotations of poses
 )
@@ -181,11 +179,9 @@ class Boxes:
     def to_table(self) -> RecordArray:
         """Return the boxes as a table, (N,) `BOXES_DTYPE`."""
         table = np.empty(len(self), BOXES_DTYPE)
-        table["track"], table["label"], table["annotated"] = (
-            self.tracks,
-            self.labels,
-            self.annotated,
-        )
+        table["track"] = self.tracks
+        table["label"] = self.labels
+        table["annotated"] = self.annotated
         numbers = np.concatenate([self.centers, self.quaternions, self.sizes], axis=1)
         for name, column in zip((*_CENTER, *_QUATERNION, *_SIZE), numbers.T, strict=True):
             table[name] = column

@@ -36,7 +36,9 @@ _WIDEST = {
     "radial-tangential": 8.0,
     "fisheye": math.radians(110),
 }
-_STEPS, _ROUNDS = 4096, 8  # length of the table of radii, and iterations of Newton's method
+# length of the table of radii, and iterations of Newton's method
+_STEPS = 4096
+_ROUNDS = 8
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 _KEYS = (
     "name",
@@ -274,7 +276,8 @@ class CameraModel:
         """Return one step of Newton's method towards the undistorted points of the `wanted`
         distorted points.
         """
-        off, small = self._distort(plane) - wanted, 1e-6
+        off = self._distort(plane) - wanted
+        small = 1e-6
         along_x, along_y = (
             (self._distort(plane + shift) - self._distort(plane - shift)) / (2 * small)
             for shift in small * np.eye(2)

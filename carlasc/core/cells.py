@@ -88,9 +88,11 @@ def find_voxel(x: float, y: float, z: float, cells: Cells) -> int:
     Cells are half-open. The index is rounded down and clipped to the last cell. In a cylindrical
     grid, an azimuth outside the bounds is changed by 2 pi if it is then inside.
     """
-    first, second = x, y
+    first = x
+    second = y
     if cells.cylindrical:
-        first, second = math.sqrt(x * x + y * y), math.atan2(y, x)
+        first = math.sqrt(x * x + y * y)
+        second = math.atan2(y, x)
         turned = second
         if second < cells.lower[1]:
             turned = second + 2 * math.pi
@@ -145,7 +147,8 @@ def fast_azimuth(x: float, y: float) -> float:
     """Return atan2(y, x) within AZIMUTH_ERROR, without a branch, so that loops vectorise; NaN at
     the origin.
     """
-    across, along = abs(y), abs(x)
+    across = abs(y)
+    along = abs(x)
     steep = across > along
     small, large = (along, across) if steep else (across, along)
     wide = small > _TAN_PI_8 * large
@@ -207,7 +210,8 @@ def joined(keys: IntArray, seeds: BoolArray, width: int) -> IntArray:
         for step in (1, width - 1, width, width + 1):
             j = np.searchsorted(keys, keys[i] + step)
             if j < len(keys) and keys[j] == keys[i] + step and seeds[j]:
-                a, b = i, j
+                a = i
+                b = j
                 while parent[a] != a:
                     a = parent[a]
                 while parent[b] != b:
@@ -252,7 +256,8 @@ def numbered(cells: IntArray) -> tuple[IntArray, IntArray]:
         while True:
             k = table[slot] - 1
             if k < 0:
-                first[count], number[i] = i, count
+                first[count] = i
+                number[i] = count
                 count += 1
                 table[slot] = count
                 break
@@ -337,11 +342,15 @@ def find_crossing(
     found = np.empty(len(points), np.int64)
     places = np.empty((len(points), 3))
     count = 0
-    reached, begin = np.empty(len(ends), np.int64), 0
+    reached = np.empty(len(ends), np.int64)
+    begin = 0
     for k in range(len(ends)):
-        pose, own = pose_of(poses, k), azimuth[begin : ends[k]]
+        pose = pose_of(poses, k)
+        own = azimuth[begin : ends[k]]
         middle, half = _seen_from(pose, box)
-        low, high = 0.0, turn - 1.0  # all rays, if the corners surround the origin
+        # all rays, if the corners surround the origin
+        low = 0.0
+        high = turn - 1.0
         if half <= math.pi / 2:
             to_steps = turn / (2 * math.pi)
             low = math.floor((middle - half + math.pi) * to_steps) - 1.0
@@ -355,7 +364,8 @@ def find_crossing(
                     found[count] = order[i]
                     places[count, 0], places[count, 1], places[count, 2] = end
                     count += 1
-        begin, reached[k] = ends[k], count
+        begin = ends[k]
+        reached[k] = count
     return found[:count], reached, places[:count]
 
 
@@ -370,9 +380,13 @@ def _seen_from(pose: Pose, box: FloatArray) -> tuple[float, float]:
     """
     if box[0, 0] < pose[3] < box[1, 0] and box[0, 1] < pose[7] < box[1, 1]:
         return 0.0, math.inf
-    angles, sine, cosine, half = np.empty(8), 0.0, 0.0, 0.0
+    angles = np.empty(8)
+    sine = 0.0
+    cosine = 0.0
+    half = 0.0
     for corner in range(8):
-        x, y = box[corner & 1, 0] - pose[3], box[corner >> 1 & 1, 1] - pose[7]
+        x = box[corner & 1, 0] - pose[3]
+        y = box[corner >> 1 & 1, 1] - pose[7]
         z = box[corner >> 2, 2] - pose[11]
         along = pose[0] * x + pose[4] * y + pose[8] * z
         angles[corner] = math.atan2(pose[1] * x + pose[5] * y + pose[9] * z, along)
@@ -387,7 +401,8 @@ def _seen_from(pose: Pose, box: FloatArray) -> tuple[float, float]:
 @jit
 def _intersects(end: Triple, pose: Pose, box: FloatArray) -> bool:
     """Return whether a ray intersects a box, from the origin of a pose to its end."""
-    enter, leave = -math.inf, math.inf
+    enter = -math.inf
+    leave = math.inf
     for axis in range(3):
         origin = pose[4 * axis + 3]
         along = end[axis] - origin
@@ -415,7 +430,9 @@ def _find_warped(points, maps, later_s, cells, voxels):  # type: ignore[no-untyp
     for w in range(len(maps)):
         m = maps[w]
         for i in range(len(points)):
-            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            x = points[i, 0]
+            y = points[i, 1]
+            z = points[i, 2]
             voxels[w, i] = find_voxel(
                 m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3] + m[0, 4] * later_s,
                 m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3] + m[1, 4] * later_s,

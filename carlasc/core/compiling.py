@@ -50,8 +50,11 @@ class CompilingNote(event.Listener):
             tell: the function. It is called in another thread during the compilation.
             after_s: compile time after which it is called, seconds.
         """
-        self._tell, self._left_s, self._told = tell, after_s, False
-        self._depth, self._started_s = 0, 0.0
+        self._tell = tell
+        self._left_s = after_s
+        self._told = False
+        self._depth = 0
+        self._started_s = 0.0
         self._timer: Timer | None = None
 
     def on_start(self, _: Any) -> None:
@@ -157,7 +160,8 @@ def _fingerprint(function: FunctionType) -> int:
     """Return a hash of the files of a function and of the compiled functions that it calls, and of
     the constants that they use.
     """
-    files, constants = set(), []
+    files = set()
+    constants = []
     for part in _parts(function, set()):
         files.add(part.__globals__.get("__file__", part.__code__.co_filename))
         for name, value in _names(part):

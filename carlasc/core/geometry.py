@@ -31,7 +31,8 @@ _GOLDEN = 0.6180339887  # multiples of it, without their integers, are spread ev
 
 def rotation_z(yaw_rad: float) -> Transform:
     """Return the (4, 4) rotation by `yaw_rad` about z. A positive angle turns x towards y."""
-    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    cos = np.cos(yaw_rad)
+    sin = np.sin(yaw_rad)
     return np.array(
         [[cos, -sin, 0, 0], [sin, cos, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=np.float64
     )
@@ -86,7 +87,8 @@ def spread_rows(count: int, most: int) -> IntArray:
     """Return at most `most` of the rows 0 to `count` - 1, spread evenly, but not at one distance:
     points of a LiDAR that turns are in order of columns, and every N-th may be of few channels.
     """
-    steps, apart = np.arange(min(count, most)), max(1.0, count / most)
+    steps = np.arange(min(count, most))
+    apart = max(1.0, count / most)
     return np.asarray(steps * apart + (apart - 1) * (steps * _GOLDEN % 1.0), np.int64)
 
 
@@ -108,7 +110,9 @@ def rotate_vectors(dst_T_src: Transform, vectors: AnyFloatArray) -> FloatArray:
     without translation.
     """
     source = np.asarray(vectors, np.float64)
-    x, y, z = source[..., 0], source[..., 1], source[..., 2]
+    x = source[..., 0]
+    y = source[..., 1]
+    z = source[..., 2]
     rotated = np.empty((*source.shape[:-1], 3))
     for row, (along_x, along_y, along_z) in enumerate(dst_T_src[:3, :3]):
         rotated[..., row] = x * along_x + y * along_y + z * along_z  # not `@`: see `multiply`
@@ -156,7 +160,9 @@ def quaternions_of(rotations: AnyFloatArray) -> FloatArray:
     The first non-zero number is positive.
     """
     r = np.asarray(rotations, np.float64)
-    xx, yy, zz = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
+    xx = r[:, 0, 0]
+    yy = r[:, 1, 1]
+    zz = r[:, 2, 2]
     wx = r[:, 2, 1] - r[:, 1, 2]
     wy = r[:, 0, 2] - r[:, 2, 0]
     wz = r[:, 1, 0] - r[:, 0, 1]
@@ -233,7 +239,9 @@ def inverse_of(transform: Transform) -> Transform:
     """Return the inverse of a (4, 4) transform that may be slightly non-rigid, bit for bit equal on
     every CPU.
     """
-    x, y, z = transform[:3, 0], transform[:3, 1], transform[:3, 2]
+    x = transform[:3, 0]
+    y = transform[:3, 1]
+    z = transform[:3, 2]
     rows = np.array([np.cross(y, z), np.cross(z, x), np.cross(x, y)])
     inverse = np.eye(4)
     inverse[:3, :3] = rows / (rows[0, 0] * x[0] + rows[0, 1] * x[1] + rows[0, 2] * x[2])
@@ -260,7 +268,8 @@ def check_rigid(transforms: AnyFloatArray, name: str, tolerance: float = 1e-3) -
     if poses.shape[-2:] != (4, 4) or poses.ndim not in (2, 3):
         raise FormatError(name, expected="4 x 4 transforms", found=f"shape {poses.shape}")
     flat = poses.reshape(-1, 4, 4)
-    rotations, farthest = flat[:, :3, :3], np.abs(flat[:, :3, 3]).max(axis=1)
+    rotations = flat[:, :3, :3]
+    farthest = np.abs(flat[:, :3, 3]).max(axis=1)
     with np.errstate(invalid="ignore", over="ignore"):
         deviation = np.maximum(
             np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(axis=(1, 2)),

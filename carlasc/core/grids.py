@@ -247,7 +247,8 @@ class GridSpec:
 
         If the bounds are not float32 numbers, their exact difference is used.
         """
-        lower, upper = np.array(self.lower), np.array(self.upper)
+        lower = np.array(self.lower)
+        upper = np.array(self.upper)
         rounded = (upper.astype(np.float32) - lower.astype(np.float32)).astype(np.float64)
         exact = (lower != lower.astype(np.float32)) | (upper != upper.astype(np.float32))
         return np.where(exact, upper - lower, rounded) / np.array(self.size, np.float64)
@@ -299,7 +300,8 @@ class GridSpec:
             (N, 3) int32 cells, clamped to the grid, and (N,) bool: whether the point is inside. NaN
             is outside.
         """
-        lower, upper = np.array(self.lower), np.array(self.upper)
+        lower = np.array(self.lower)
+        upper = np.array(self.upper)
         inside: BoolArray = np.all((axes >= lower) & (axes < upper), axis=1)
         cells = np.floor((np.where(inside[:, None], axes, lower) - lower) / self.voxel_size)
         return np.clip(cells, 0, np.array(self.size) - 1).astype(np.int32), inside
@@ -328,7 +330,8 @@ class GridSpec:
             left_handed: False for data with y to the left; y then points to the left of the
                 picture.
         """
-        occupied, layers = labels > 0, self.size[2]
+        occupied = labels > 0
+        layers = self.size[2]
         top = layers - 1 - np.argmax(occupied[:, :, ::-1], axis=2)
         highest = np.take_along_axis(labels, top[:, :, None], axis=2)[:, :, 0]
         colors = (
@@ -339,7 +342,8 @@ class GridSpec:
         darkest = _DARKEST[palette is not None]
         colors *= darkest + (1 - darkest) * top[:, :, None] / max(layers - 1, 1)
         colors[~occupied.any(axis=2)] = 255
-        radius, steps = self.upper[0], (np.arange(_PIXELS) + 0.5) / _PIXELS
+        radius = self.upper[0]
+        steps = (np.arange(_PIXELS) + 0.5) / _PIXELS
         ends = (
             [(-radius, radius)] * 2
             if self.coordinates == "cylindrical"

@@ -26,7 +26,8 @@ def from_plain(value: Any, kind: Any, name: str = "the value") -> Any:
         ValueError: the value has another type, lacks a key, or is a number that is not finite or
             has more than 64 bits.
     """
-    origin, parts = typing.get_origin(kind) or kind, typing.get_args(kind)
+    origin = typing.get_origin(kind) or kind
+    parts = typing.get_args(kind)
     if kind is Any:
         return value
     if origin in (types.UnionType, typing.Union):

@@ -32,7 +32,10 @@ from carlasc.errors import FormatError, check_types, count
 # Points that move by this share of the half of their distances, and more than a metre, while poses
 # move by a fifth of that and the distance of the nearest points changes by a factor, are in a frame
 # that they were moved to.
-_CENTRE, _CENTRE_M, _STANDING, _NEARER = 0.4, 1.0, 0.2, 1.3
+_CENTRE = 0.4
+_CENTRE_M = 1.0
+_STANDING = 0.2
+_NEARER = 1.3
 _SAMPLE = 4000  # points of a scan that tell it
 
 _TURN = 65_000  # steps of azimuth per turn, of about 0.1 mrad; they fit into 16 bits

@@ -224,7 +224,8 @@ def _tags(name: str, number: int) -> ClassTable:
     )
 
 
-CARLA0914, CARLAOCC = _tags("carla0.9.14", 29), _tags("carlaocc", 30)
+CARLA0914 = _tags("carla0.9.14", 29)
+CARLAOCC = _tags("carlaocc", 30)
 
 # the classes of SSCBench, and their raw ids in its files
 _SSCBENCH = [
@@ -461,7 +462,8 @@ def remaps_between(source: ClassTable, target: ClassTable) -> tuple[Remap, ...]:
         return ()
     if (remap := direct(source, target)) is not None:
         return (remap,)
-    first, second = direct(source, CARLA), direct(CARLA, target)
+    first = direct(source, CARLA)
+    second = direct(CARLA, target)
     if first is None or second is None:
         ways = sorted(
             {r.target.name for r in REMAPS.values() if r.source == source} | {source.name}

@@ -195,7 +195,8 @@ class GridFields:
                 known = known & is_confident(read("occupied"), self.min_confidence)
             sample["known"] = known
         if "posterior" in self.fields:
-            occupied, classes = read("occupied"), read("classes")
+            occupied = read("occupied")
+            classes = read("classes")
             sample["posterior"] = soft_labels(
                 occupied, classes, sample["known"], label_map, where("classes")
             )
@@ -233,7 +234,8 @@ def soft_labels(
     Raises:
         FormatError: a voxel is not in the grid, or a class id is not in the map.
     """
-    voxel, count = classes["voxel"].astype(np.int64), known.size
+    voxel = classes["voxel"].astype(np.int64)
+    count = known.size
     if len(voxel) and not 0 <= int(voxel.min()) <= int(voxel.max()) < count:
         outside = voxel[(voxel < 0) | (voxel >= count)]
         raise FormatError(where, expected=f"voxels 0 to {count - 1}", found=outside[0])

@@ -89,7 +89,8 @@ class ResizeImages:
         Raises:
             DependencyError: Pillow is not installed.
         """
-        made, size = dict(cast(Values, sample)), (self.width, self.height)
+        made = dict(cast(Values, sample))
+        size = (self.width, self.height)
         picture = import_extra("PIL.Image", "render")
         if "images" in made:
             images: Mapping[str, Uint8Array] = made["images"]

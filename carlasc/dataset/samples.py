@@ -311,7 +311,8 @@ class Dataset(_MapStyle):
             raise ArgumentError(
                 "index", expected="a slice with a step of 1 or more", found=chosen.step
             )
-        part, places = copy.copy(self), np.arange(len(self))[chosen]
+        part = copy.copy(self)
+        places = np.arange(len(self))[chosen]
         ends = zip(self._starts[:-1].tolist(), self._starts[1:].tolist(), self._parts, strict=True)
         part._parts = [
             replace(whole, frames=whole.frames[places[(places >= start) & (places < end)] - start])
@@ -381,7 +382,8 @@ class Dataset(_MapStyle):
             ArgumentError: the samples do not have this field.
         """
         check_choice("field", field, [name for name in self.fields if name.endswith("labels")])
-        plain, channels = copy.copy(self), max(self.classes.names) + 1
+        plain = copy.copy(self)
+        channels = max(self.classes.names) + 1
         plain.transform = None
         plain.fields = (field, *({"known"} & set(self.fields) if field == "labels" else ()))
         plain._grid_fields = replace(self._grid_fields, fields=frozenset(plain.fields))

@@ -175,7 +175,8 @@ class ShardSampler(_Sampler):
 
     def __iter__(self) -> Iterator[int]:
         """Iterate over an epoch, or over the rest of it after `load_state_dict`."""
-        epoch, start = self.epoch, self._next
+        epoch = self.epoch
+        start = self._next
         self._next = self._begun = self._drawn = 0
         # the state of a finished epoch was loaded: continue with the next epoch
         if start == len(self._shards):
@@ -234,7 +235,8 @@ class ShardSampler(_Sampler):
                 found={name: state.get(name) for name in different or ("position",)},
                 advice="the data and the arguments `shard` and `window` must be the same",
             )
-        self.seed, self.epoch = int(state["seed"]), int(state["epoch"])
+        self.seed = int(state["seed"])
+        self.epoch = int(state["epoch"])
         self._next = self._begun = self._drawn = int(state["position"])
 
     def _about(self) -> dict[str, int]:
@@ -317,7 +319,8 @@ class ReadAhead:
             self._next_shards = deque(numbers[left][by_first].tolist())
             self._firsts = firsts[left][by_first]
         else:
-            self._next_shards, self._firsts = deque(), np.empty(0, np.int64)
+            self._next_shards = deque()
+            self._firsts = np.empty(0, np.int64)
 
     def draw(self, position: int) -> None:
         """Record the position in the order that was drawn last."""

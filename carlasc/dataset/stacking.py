@@ -48,7 +48,8 @@ def stack_scans(
         (T, X, Y, Z) uint8 0 or 1, or int32 number of points per voxel.
     """
     stack = np.zeros((len(scans), *spec.size), np.uint8 if what == "occupancy" else np.int32)
-    cells, geometry = Cells.of(spec), _geometry(spec)
+    cells = Cells.of(spec)
+    geometry = _geometry(spec)
     ranges = (min_range_m or 0.0, math.inf if max_range_m is None else float(max_range_m))
     rows = grid_T_scans[:, :3].reshape(-1, 12).tolist()
     for grid, points, row in zip(stack.reshape(len(scans), -1), scans, rows, strict=True):
@@ -79,7 +80,8 @@ def _geometry(spec: GridSpec) -> tuple[Any, ...]:
     """Return the constants of the fast arithmetic: lower bounds, cells per metre or radian, sizes,
     and its maximum error in cells.
     """
-    voxel, sizes = spec.voxel_size, tuple(float(n) for n in spec.size)
+    voxel = spec.voxel_size
+    sizes = tuple(float(n) for n in spec.size)
     # 1e-6: rounding of a product and a difference of float64. 1e-7 a cell: voxel_size is a float32
     # difference, whose multiple is off from the bounds by up to 6e-8 of the size of the grid.
     doubt = 1e-6 + 1e-7 * max(sizes)
@@ -117,7 +119,8 @@ def _split_columns(words, x, y, z):  # type: ignore[no-untyped-def]
     """
     # on little-endian machines the first of two numbers is in the lower half of its word
     for n in range(len(words) // 2):
-        xy, zw = words[2 * n], words[2 * n + 1]
+        xy = words[2 * n]
+        zw = words[2 * n + 1]
         x[n] = np.uint32(xy).view(np.float32)
         y[n] = np.uint32(xy >> np.uint64(32)).view(np.float32)
         z[n] = np.uint32(zw).view(np.float32)
@@ -137,7 +140,9 @@ def _leave_out(x, y, z, count, near_squared, far_squared):  # type: ignore[no-un
 def _move(x, y, z, count, rows):  # type: ignore[no-untyped-def]
     r00, r01, r02, t0, r10, r11, r12, t1, r20, r21, r22, t2 = rows
     for n in range(count):
-        a, b, c = x[n], y[n], z[n]
+        a = x[n]
+        b = y[n]
+        c = z[n]
         x[n] = a * r00 + b * r01 + c * r02 + t0
         y[n] = a * r10 + b * r11 + c * r12 + t1
         z[n] = a * r20 + b * r21 + c * r22 + t2
@@ -172,8 +177,12 @@ def _find_cells(x, y, z, count, geometry, cells):  # type: ignore[no-untyped-def
     doubtful = 0
     for n in range(count):
         # in cells from the lower corner of the grid; a point in doubt is at most `doubt` off
-        a, b, c = (x[n] - l0) * w0, (y[n] - l1) * w1, (z[n] - l2) * w2
-        i, j, k = np.floor(a), np.floor(b), np.floor(c)
+        a = (x[n] - l0) * w0
+        b = (y[n] - l1) * w1
+        c = (z[n] - l2) * w2
+        i = np.floor(a)
+        j = np.floor(b)
+        k = np.floor(c)
         inside = (i >= 0) & (i < s0) & (j >= 0) & (j < s1) & (k >= 0) & (k < s2)
         # nearer than `doubt` to a face of its cell; outside of the grid too, since the exact rule
         # may put such a point into the outermost cell. `|`, not `or`: branches do not vectorise.
@@ -228,8 +237,11 @@ def _bin_block(  # type: ignore[no-untyped-def]
 @cached
 def _bin_rows(words, rows, cells, geometry, ranges, grid):  # type: ignore[no-untyped-def]
     # the same buffers for all blocks: they stay in the first-level cache
-    x, y, z = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
-    radius, azimuth = np.empty(_BLOCK), np.empty(_BLOCK)
+    x = np.empty(_BLOCK)
+    y = np.empty(_BLOCK)
+    z = np.empty(_BLOCK)
+    radius = np.empty(_BLOCK)
+    azimuth = np.empty(_BLOCK)
     voxels = np.empty(_BLOCK, np.int32)
     for start in range(0, len(words), 2 * _BLOCK):
         block = words[start : start + 2 * _BLOCK]
@@ -241,12 +253,17 @@ def _bin_rows(words, rows, cells, geometry, ranges, grid):  # type: ignore[no-un
 
 @cached
 def _bin_planes(xs, ys, zs, rows, cells, geometry, ranges, grid):  # type: ignore[no-untyped-def]
-    x, y, z = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
-    radius, azimuth = np.empty(_BLOCK), np.empty(_BLOCK)
+    x = np.empty(_BLOCK)
+    y = np.empty(_BLOCK)
+    z = np.empty(_BLOCK)
+    radius = np.empty(_BLOCK)
+    azimuth = np.empty(_BLOCK)
     voxels = np.empty(_BLOCK, np.int32)
     for start in range(0, len(xs), _BLOCK):
         end = start + _BLOCK
-        block_x, block_y, block_z = xs[start:end], ys[start:end], zs[start:end]
+        block_x = xs[start:end]
+        block_y = ys[start:end]
+        block_z = zs[start:end]
         count = len(block_x)
         # copied although they are contiguous: the steps work in place and in float64
         for n in range(count):

@@ -261,7 +261,8 @@ def moved(
     Raises:
         ArgumentError: the sample has grids, and none is given, or they have another size.
     """
-    new_T_old, made = placement.new_T_old, dict(sample)
+    new_T_old = placement.new_T_old
+    made = dict(sample)
     if placement.drop:
         made |= {
             name: value[placement.kept(len(value))]
@@ -282,7 +283,8 @@ def moved(
     with np.errstate(invalid="ignore"):  # of points that are not finite
         for name in {"points", "flow", "voxel_flow"} & made.keys():
             move = transform_points if name == "points" else rotate_vectors
-            old, linear = made[name], new_T_old[:3, :3]
+            old = made[name]
+            linear = new_T_old[:3, :3]
             if not new_T_old[:3, 3].any() and (linear == np.diag(linear.diagonal())).all():
                 made[name] = old * linear.diagonal().astype(old.dtype)  # a flip
             else:
@@ -306,7 +308,8 @@ def _posed(new_T_old: Transform, old_T_camera: Transform) -> Transform:
 
 def _resampled(name: str, grid: AnyArray, spec: GridSpec, new_T_old: Transform) -> AnyArray:
     """Return a field of grids, of the old voxels at the centres of the new ones."""
-    first, shape = _FIRST_GRID_AXIS[name], grid.shape
+    first = _FIRST_GRID_AXIS[name]
+    shape = grid.shape
     voxels = _old_voxels(spec, tuple(new_T_old.ravel().tolist()))
     flat = grid.reshape(*shape[:first], len(voxels), *shape[first + 3 :])
     made = flat.take(voxels, axis=first)
@@ -330,7 +333,8 @@ def check_symmetric(spec: GridSpec, direction: str) -> None:
     """
     column = _DIRECTIONS.index(direction)
     bounds = 1 if spec.coordinates == "cylindrical" else column
-    lower, upper = spec.lower[bounds], spec.upper[bounds]
+    lower = spec.lower[bounds]
+    upper = spec.upper[bounds]
     if not math.isclose(lower, -upper, abs_tol=_TOLERANCE):
         raise ArgumentError(
             f"flip of {direction}",

@@ -47,7 +47,8 @@ class CaptureFrame(FrameInput):
 
     def fields(self) -> tuple[str, ...]:
         """Return points, labels, flow and instances, and the pictures that the frame has."""
-        capture, frame = self.capture, self.source_frame
+        capture = self.capture
+        frame = self.source_frame
         bev = ("bev",) if capture.has_bev(frame) else ()
         images = capture.image_fields(frame) if capture.cameras else ()
         return ("points", "labels", "flow", "instances", *capture.effects.fields, *bev, *images)
@@ -75,7 +76,8 @@ class CaptureFrame(FrameInput):
             fields["bev"] = np.frombuffer(picture, np.uint8)
         if self.capture.cameras:
             fields |= self.capture.read_images(self.source_frame)
-        step, classes = plan.voting.free_step_m, self.capture.classes
+        step = plan.voting.free_step_m
+        classes = self.capture.classes
         who = (
             ActorPoints(plan.spec, self._turns(), classes.deformable)
             if plan.voting.keep_actors
@@ -108,12 +110,11 @@ class CaptureFrame(FrameInput):
         their velocity.
         """
         before, after = (self.capture.read_velocities(frame) for frame in self.around)
-        seconds, turns = (
-            (self.around[1] - self.around[0]) * layout.FRAME_PERIOD_S,
-            dict[int, float](),
-        )
+        seconds = (self.around[1] - self.around[0]) * layout.FRAME_PERIOD_S
+        turns = dict[int, float]()
         for actor in before.keys() & after.keys() if seconds else ():
-            first, last = before[actor], after[actor]
+            first = before[actor]
+            last = after[actor]
             if min(np.hypot(*first[:2]), np.hypot(*last[:2])) > _TURNING_M_S:
                 angle = np.arctan2(
                     first[0] * last[1] - first[1] * last[0], first[0] * last[0] + first[1] * last[1]
@@ -143,22 +144,22 @@ class CaptureSequence(SequenceInput):
     """A capture as a sequence: its frames are renumbered from 0."""
 
     def __init__(self, capture: Capture, path: str, plan: GridPlan) -> None:
-        self.path, self.location, self.metadata = (
-            path,
-            capture.location,
-            Metadata(
-                classes=capture.classes,
-                extra={"simulated": True} if capture.is_simulated else {},
-            ),
+        self.path = path
+        self.location = capture.location
+        self.metadata = Metadata(
+            classes=capture.classes,
+            extra={"simulated": True} if capture.is_simulated else {},
         )
-        self.capture, self.plan = capture, plan
+        self.capture = capture
+        self.plan = plan
 
     def _find_frames(self) -> tuple[FrameInput, ...]:
         capture = self.capture
         numbers = choose_frames(self.plan.frames, np.array(capture.frames), capture.location)
         # Frames hold a copy of the capture without its cached listing, which would be pickled with
         # each frame.
-        light, known = capture.light(), capture.frames
+        light = capture.light()
+        known = capture.frames
         place = np.searchsorted(known, numbers)
         around = [
             known[np.clip(place + step, 0, len(known) - 1)].tolist()
@@ -231,7 +232,8 @@ class CaptureSequence(SequenceInput):
         An open end of the range stays open, so that a later run continues after the capture has
         grown.
         """
-        asked, first = self.plan.frames, self.frames[0].source_frame
+        asked = self.plan.frames
+        first = self.frames[0].source_frame
         frames = str(asked)
         if asked.stop is None:
             frames = f"{first}:"

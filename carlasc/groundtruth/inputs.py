@@ -345,9 +345,11 @@ class StoredSequence(SequenceInput):
     """A sequence of the layout. Its scans, poses, times and frame numbers are kept."""
 
     def __init__(self, sequence: Sequence, plan: GridPlan) -> None:
-        self.sequence, self.plan = sequence, plan
+        self.sequence = sequence
+        self.plan = plan
         self.path = layout.place_of(sequence.path)
-        self.location, self.metadata = sequence.location, sequence.metadata
+        self.location = sequence.location
+        self.metadata = sequence.metadata
 
     def files(self) -> FrameFiles | None:
         """Return the files of the scans."""
@@ -410,6 +412,12 @@ class InputCheck:
         return f"made-{self.grid}"
 
     @cached_property
+    def copied(self) -> Collection[str]:
+        """The fields of scans that the output may have; none if it is the input."""
+        places = self.writer.location, self.inputs.location
+        return layout.SCAN_FIELDS if len({*map(os.path.realpath, places)}) > 1 else ()
+
+    @cached_property
     def is_provisional(self) -> bool:
         """Whether the grid was made while the input grew, so that all of its frames are made
         again.
@@ -417,17 +425,23 @@ class InputCheck:
         return MadeFrom.read(self.writer, self._name).whole == PROVISIONAL
 
     def look(
-        self, existing: Collection[int], agrees: Callable[[int], bool | None], run: Run
+        self,
+        existing: Collection[int],
+        begun: Collection[int],
+        agrees: Callable[[int], bool | None],
+        run: Run,
     ) -> None:
         """Find the frames that must be made again.
 
         Args:
             existing: frames that exist in the output.
+            begun: frames of which the output has a scan and no grid.
             agrees: makes a frame again, and returns whether the existing one is equal; None if it
                 cannot be made.
             run: how the reading of files is spread.
         """
-        inputs, files = self.inputs, self.inputs.files()
+        inputs = self.inputs
+        files = self.inputs.files()
         record = self._record = MadeFrom.read(self.writer, self._name)
         kept = self.compare == "never" and existing and not self.is_provisional
         if files is None or kept:
@@ -440,6 +454,8 @@ class InputCheck:
         self.gone = {int(frame) for frame in record.frames} - set(inputs.available())
         again = dict.fromkeys(existing, "") if self.is_provisional else {}
         recorded = {frame: record.frames.get(str(frame)) for frame in existing} | again
+        if record.own:  # a run that was killed had written their scans
+            recorded |= {n: made for n in begun if (made := record.frames.get(str(n))) is not None}
         if not self.changed and all(recorded.values()):
             return
         inputs.prepare(self.writer, run, StepCounter(None))
@@ -457,7 +473,7 @@ class InputCheck:
                 was_interrupted = "" in recorded.values()
                 why = "a run was interrupted" if was_interrupted else "what all scans share changed"
             self.notes.append(f"{self.writer.location}: {made_again(self.stale, why)}")
-        if unknown := [frame for frame in sorted(existing) if recorded[frame] is None]:
+        if unknown := [frame for frame, made in sorted(recorded.items()) if made is None]:
             self._accept(unknown, agrees)
             self.must_record = True
 
@@ -514,12 +530,12 @@ class InputCheck:
         """
         if not self._whole:
             return
-        record, writer = self._record, self.writer
-        is_copy = os.path.realpath(writer.location) != os.path.realpath(self.inputs.location)
+        record = self._record
+        writer = self.writer
         if self.gone:
             written = [f"{self.grid}/{part}" for part in layout.GRID_FIELDS]
-            writer.remove_frames([*(layout.SCAN_FIELDS if is_copy else ()), *written], self.gone)
-        if (self.changed or self.gone) and is_copy:
+            writer.remove_frames([*self.copied, *written], self.gone)
+        if (self.changed or self.gone) and self.copied:
             self._remove_others()
         for frame in self.gone:
             del record.frames[str(frame)]
@@ -537,7 +553,8 @@ class InputCheck:
 
     def _remove_others(self) -> None:
         """Remove from a copy the lines, text files and fields that the input has no longer."""
-        inputs, writer = self.inputs, self.writer
+        inputs = self.inputs
+        writer = self.writer
         of_frames = {layout.POSES: inputs.poses(), layout.TIMES: inputs.times()}
         for name, lines in of_frames.items():
             if self.gone and (left := agree_lines(writer, name, lines, is_whole=True)):

@@ -96,10 +96,8 @@ class FromScans:
                 expected='none with dynamic "tube", which ignores motion',
                 found=repr(self.motion.source),
             )
-        low, high = (
-            self.min_range_m or 0.0,
-            math.inf if self.max_range_m is None else self.max_range_m,
-        )
+        low = self.min_range_m or 0.0
+        high = math.inf if self.max_range_m is None else self.max_range_m
         if not 0 <= low < high:
             raise ArgumentError(
                 "min_range_m",
@@ -226,10 +224,8 @@ def fit_to_reach(spec: GridSpec, reach_m: float) -> GridSpec:
     The voxels of the published grid become as much smaller, and cubes, as of `--res`, keep their
     size. Other grids do not change.
     """
-    published, cubic = (
-        spec == GridSpec.published(),
-        np.allclose(spec.voxel_size[0], spec.voxel_size),
-    )
+    published = spec == GridSpec.published()
+    cubic = np.allclose(spec.voxel_size[0], spec.voxel_size)
     if spec.coordinates != "cartesian" or not (published or cubic):
         return spec
     scale = 1

@@ -14,7 +14,7 @@ import numpy as np
 
 from carlasc.errors import CarlascError
 from carlasc.groundtruth.from_scans.feed import ScanFeed
-from carlasc.groundtruth.from_scans.motion_pass import follower_of, track_of, untracked
+from carlasc.groundtruth.from_scans.motion_pass import follower_of, track_of
 from carlasc.groundtruth.from_scans.sequences import ScanFrame, ScanSequence, ScanWindow
 from carlasc.groundtruth.inputs import GridPlan
 from carlasc.groundtruth.options import FromScans
@@ -22,7 +22,7 @@ from carlasc.groundtruth.run import FrameTask, settings_of
 from carlasc.motion import Track, complete_bodies
 from carlasc.motion.evidence import EvidenceWindow
 from carlasc.motion.found_actors import FoundActor
-from carlasc.motion.tracks import MovingActors
+from carlasc.motion.tracks import FIRST_FOUND, MovingActors
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
 from carlasc.storage.inputs import PROVISIONAL, MadeFrom
@@ -31,7 +31,8 @@ from carlasc.storage.protocol import Sequence, SequenceWriter, Sink
 from carlasc.storage.resuming import check_grid
 
 _AFTER_S = 0.8  # scans up to so much later show what moves in a scan
-_AGAIN_S = 2.0  # tracks are estimated again after so much of the drive
+# A track is estimated again after so much of the drive: of so many actors with each scan, at most.
+_AGAIN_S, _TOGETHER = 2.0, 2
 _KEPT = 80  # frames whose observations of actors are kept, at least
 _MOST, _EACH = 120, 4  # scans that may wait; N grows by one with so many of them
 
@@ -63,7 +64,7 @@ def make_provisional(
         try:
             drive.take(frame)
             made += drive.make_grid()
-        except (CarlascError, OSError) as error:
+        except (CarlascError, OSError, MemoryError) as error:
             problems.append(f"no grid of frame {frame} yet: {error}")
     return made, problems
 
@@ -85,8 +86,7 @@ class _GrowingDrive:
         movable = feed.classes.movable if feed.trusts_ground_labels else ()
         self._evidence = EvidenceWindow(movable, after_s=_AFTER_S)
         self._follower = follower_of(feed)
-        self._tracks, self._actors = list[Track](), MovingActors()
-        self._tracked_s, self._numbered = -np.inf, 1
+        self._tracks, self._searched_s = dict[int, Track](), -np.inf
 
     def choose(self, sequence: Sequence) -> list[int]:
         """Return the scans to take: every N-th one."""
@@ -108,7 +108,12 @@ class _GrowingDrive:
             return
         for found in self._evidence.add(self.feed.evidence_scan(frame, ())):
             self._judge(found.frame)
-            self._tracks += map(self._track, self._follower.add(found.thinned()))
+            follower, before_s = self._follower, found.seconds - _AGAIN_S
+            actors = follower.add(found.thinned())
+            self._track([*actors, *follower.again(before_s, _TOGETHER)])
+            if self._searched_s <= before_s:
+                self._searched_s = found.seconds
+                follower.find_own()
 
     def _judge(self, frame: int) -> None:
         """Merge a frame from now on, and forget old ones."""
@@ -116,7 +121,7 @@ class _GrowingDrive:
         self._judged = [one for one in [*self._judged, frame] if one >= oldest]
         self.feed.use(self.feed.sequence, self._judged)
         self._follower.forget_before(oldest)
-        self._tracks = [track for track in self._tracks if max(track.members) >= oldest]
+        self._tracks = {n: one for n, one in self._tracks.items() if max(one.members) >= oldest}
 
     def make_grid(self) -> list[int]:
         """Make and write the grid of the newest frame whose window is complete, unless it is
@@ -134,10 +139,9 @@ class _GrowingDrive:
         self._unmade = number + 1
         near = self._actors_now().between(number + self.first, number + self.last)
         frame = ScanFrame(ScanWindow(self.feed, near), number, number)
-        made = FrameTask(number, frame, self.plan, self.feed.classes, False).run()
-        if made.error:
-            raise CarlascError(self.feed.sequence.location, problem=made.error)
-        fields = {n: data for n, data in made.outputs.items() if n.startswith(f"{self.plan.grid}/")}
+        task = FrameTask(number, frame, self.plan, self.feed.classes, False)
+        made, _ = task.outputs_of(frame.make(self.plan), frame)
+        fields = {n: data for n, data in made.items() if n.startswith(f"{self.plan.grid}/")}
         self.writer.write_frames({number: fields})
         return [number]
 
@@ -159,24 +163,23 @@ class _GrowingDrive:
                 writer.remove_grid(plan.grid)
             writer.write_document(document, to_json(params))
 
-    def _track(self, actor: FoundActor) -> Track:
-        return track_of(actor, self.feed.times, self.feed.classes.deformable)
+    def _track(self, actors: list[FoundActor]) -> None:
+        """Estimate the tracks of actors, instead of earlier ones of the same actors. The others
+        stay, with what is kept of them.
+        """
+        follower, classes = self._follower, self.feed.classes
+        tracks = [track_of(actor, self.feed.times, classes.deformable) for actor in actors]
+        gone, follower.replaced = follower.replaced, set()
+        stay = {n: track for n, track in self._tracks.items() if n not in gone}
+        whole = complete_bodies(tracks, stay.values())
+        self._tracks = stay | {track.instance: track for track in whole if track.moves}
 
     def _actors_now(self) -> MovingActors:
-        """Return the moving actors; their tracks are at most `_AGAIN_S` old."""
-        now_s = self.feed.time(self._judged[-1])
-        if now_s - self._tracked_s >= _AGAIN_S and self.feed.needs_actors:
-            self._tracked_s = now_s
-            follower = self._follower
-            every = [*self._tracks, *map(self._track, follower.finish())]
-            every = [track for track in every if track.instance not in follower.riders]
-            moving = untracked(follower.moved, [track for track in every if track.is_possible])
-            actors = MovingActors.of(complete_bodies(every), moving, follower.own)
-            # what was kept of an actor is not of this track of it: each gets a new number
-            numbered = {self._numbered + n: track for n, track in actors.tracks.items()}
-            self._numbered += len(every)
-            self._actors = replace(actors, tracks=numbered, numbers={n: n for n in numbered})
-        return replace(self._actors, moving={**self._follower.moved, **self._actors.moving})
+        """Return the moving actors."""
+        follower = self._follower
+        tracks = {n: one for n, one in self._tracks.items() if n not in follower.riders}
+        numbers = {number: number - FIRST_FOUND + 1 for number in tracks}
+        return MovingActors(tracks, follower.moved, own=tuple(follower.own), numbers=numbers)
 
 
 _DRIVES: dict[str, _GrowingDrive] = {}  # the drive of this process, by its key

@@ -25,10 +25,8 @@ from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.inputs import digest_of, digest_of_bytes
 
 # of one observation: points that are used, and points whose distance is measured
-_MOST_POINTS, _MOST_ASKED = (
-    600,
-    50,
-)
+_MOST_POINTS = 600
+_MOST_ASKED = 50
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,8 @@ class Residual:
             world_T_actor: (4, 4) pose of the actor at the first observation.
             world_T_next: (4, 4) its pose at the next one.
         """
-        one, other = thin(one, _MOST_POINTS), thin(other, _MOST_POINTS)
+        one = thin(one, _MOST_POINTS)
+        other = thin(other, _MOST_POINTS)
         static = _distances(one, other)
         moving = _distances(
             transform_points(invert(world_T_actor), one),
@@ -258,7 +257,6 @@ class FrameFacts:
         frame: int,
         arrays: Mapping[str, AnyArray],
         grid: str,
-        spec: GridSpec,
         classes: ClassTable,
         changes: Changes | None = None,
         residuals: Mapping[int, Residual] | None = None,
@@ -269,7 +267,6 @@ class FrameFacts:
             frame: frame number.
             arrays: the fields of the frame, by name; those of the grid among them.
             grid: name of the grid's folder.
-            spec: geometry of the grid.
             classes: class table of the grid's labels.
             changes: as in the attributes.
             residuals: as in the attributes.
@@ -286,13 +283,12 @@ class FrameFacts:
         if counts is not None:
             seen = np.asarray(counts).reshape(-1)
             known = seen > 0
-            labels, seen = labels[known], seen[known]
+            labels = labels[known]
+            seen = seen[known]
             # the exponents of float32: several times faster than `frexp`
             powers = np.clip((seen.astype(np.float32).view(np.int32) >> 23) - 127, 0, POWERS - 1)
-            votes, votes_sum = (
-                np.bincount(powers, minlength=POWERS),
-                float(seen.sum(dtype=np.float64)),
-            )
+            votes = np.bincount(powers, minlength=POWERS)
+            votes_sum = float(seen.sum(dtype=np.float64))
         # counting a label of 2**32 - 1 would take 32 GB
         classes.check(labels, f"{grid}: frame {frame}")
         by_class = np.bincount(labels, minlength=classes.num_channels)
@@ -503,7 +499,6 @@ class Report:
         *,
         actors: Sequence[Mapping[str, Any]] | None = None,
         poses: PoseFacts | None = None,
-        holdout: Mapping[str, Any] | None = None,
     ) -> Self:
         """Make a report.
 
@@ -515,7 +510,6 @@ class Report:
             documents: the text files that belong to the grid, by name.
             actors: the facts of each actor, by number; None if actors were not tracked.
             poses: as in the attributes.
-            holdout: as in the attributes.
         """
         rows = sorted(facts, key=lambda row: row.frame)
         frames = tuple(row.frame for row in rows)
@@ -539,7 +533,7 @@ class Report:
             else actors_of(actors, (row.residuals for row in rows), classes),
             poses=poses,
             inferred_share=share,
-            holdout=holdout,
+            holdout=None,
             digests={name: _digests(rows, name) for name in names},
             documents={name: FileDigest.of(data) for name, data in sorted(documents.items())},
             versions=_versions(),
@@ -547,9 +541,11 @@ class Report:
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain values for JSON."""
-        values, own = asdict(self), f"{self.grid}/"
+        values = asdict(self)
+        own = f"{self.grid}/"
         digests = values.pop("digests").items()
-        coverage, convergence = self.coverage, self.convergence
+        coverage = self.coverage
+        convergence = self.convergence
         shares = "known_share", "occupied_share"
         values["coverage"] |= {name: getattr(coverage, name) for name in shares}
         if convergence is not None:
@@ -642,7 +638,8 @@ def _coverage(rows: list[FrameFacts], settings: Mapping[str, Any], classes: Clas
 
 
 def _digests(rows: list[FrameFacts], name: str) -> Digests:
-    whole, frames = blake2b(digest_size=16), []
+    whole = blake2b(digest_size=16)
+    frames = []
     for row in rows:
         digest = row.digests.get(name)
         frames.append(_ABSENT if digest is None else short(digest))

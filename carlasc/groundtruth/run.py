@@ -215,7 +215,8 @@ def regrid(
 
     grids = tuple(sink.place(f"{job.path}/{grid}") for job in jobs)
     notes = tuple(note for job in jobs for note in (*job.check.notes, *job.inputs.notes()))
-    made, took = work.wanted - len(failures), time.perf_counter() - start
+    made = work.wanted - len(failures)
+    took = time.perf_counter() - start
     stored = [job.inputs.sequence for job in jobs if isinstance(job.inputs, StoredSequence)]
     uses = tuple(sorted({sequence.table_use() for sequence in stored}))
     return RegridResult(grids, spec, made, work.skipped, tuple(failures), took, notes, uses)
@@ -360,7 +361,8 @@ def _begin(job: SequenceJob) -> None:
     Raises:
         ConflictError: such a run wrote its settings first.
     """
-    writer, params = job.writer, layout.params_file(job.plan.grid)
+    writer = job.writer
+    params = layout.params_file(job.plan.grid)
     if job.replaces:
         writer.remove_grid(job.plan.grid)
     if writer.create_document(params, job.documents[params]):
@@ -417,7 +419,9 @@ class FrameTask:
 
     def run(self) -> FrameResult:
         """Do the work, in a worker. The arrays of a new frame are returned, and not written yet."""
-        plan, number, frame = self.plan, self.number, self.frame
+        plan = self.plan
+        number = self.number
+        frame = self.frame
         try:
             # first, while no outputs take memory
             thinned = frame.thinned(plan) if self.sampled and frame is not None else None
@@ -425,15 +429,13 @@ class FrameTask:
                 arrays, grid = self._read(self.existing)
                 outputs = Outputs()
             elif frame is not None:
-                arrays, grid = self._outputs_of(frame.make(plan), frame)
+                arrays, grid = self.outputs_of(frame.make(plan), frame)
                 outputs = arrays
             else:
                 raise MissingDataError(f"frame {number}", expected="in the source", found="none")
             changes = None if thinned is None else Changes.between(grid, thinned)
             residuals = None if frame is None else frame.residuals()
-            facts = FrameFacts.of(
-                number, arrays, plan.grid, plan.spec, self.classes, changes, residuals
-            )
+            facts = FrameFacts.of(number, arrays, plan.grid, self.classes, changes, residuals)
         except MemoryError as error:
             raise CarlascError(
                 str(plan.spec),
@@ -444,7 +446,7 @@ class FrameTask:
             return FrameResult(self, error=str(error))
         return FrameResult(self, outputs, facts=facts)
 
-    def _outputs_of(self, data: FrameData, frame: FrameInput) -> tuple[Outputs, Grid]:
+    def outputs_of(self, data: FrameData, frame: FrameInput) -> tuple[Outputs, Grid]:
         """Return all arrays to write for a frame, the grid last, and the grid.
 
         Raises:
@@ -461,7 +463,8 @@ class FrameTask:
             raise MissingDataError(where, expected="how certain each voxel is", found="nothing")
         if voting.min_confidence and counts is not None and evidence is not None:
             confident = is_confident(evidence.occupied, voting.min_confidence)
-            labels, counts = labels * confident, counts * confident
+            labels = labels * confident
+            counts = counts * confident
         parts: Outputs = {"labels": labels}
         parts |= {} if counts is None else {"counts": counts}
         if voting.keep and data.votes is not None:
@@ -480,7 +483,8 @@ class FrameTask:
 
     def _read(self, writer: SequenceWriter) -> tuple[Outputs, Grid]:
         """Return the arrays of a frame that exists, and its grid."""
-        plan, arrays = self.plan, Outputs()
+        plan = self.plan
+        arrays = Outputs()
         names = (*layout.SCAN_FIELDS, *(f"{plan.grid}/{part}" for part in layout.GRID_FIELDS))
         with reading(f"frame {self.number}", "a grid with labels and counts"):
             for name in names:
@@ -609,7 +613,8 @@ class SequenceJob:
         time.
         """
         self.writer.refresh()
-        has, grid = self.writer.has, self.plan.fields()
+        has = self.writer.has
+        grid = self.plan.fields()
         frames = self.inputs.frames
         return {
             frame.number
@@ -622,13 +627,15 @@ class SequenceJob:
         must be made, because they lack a file or their inputs changed.
         """
         missing = self.missing()
-        self.check.look(self.numbers - missing, self._agrees, run)
+        begun = {n for n in missing if any(self.writer.has(name, n) for name in self.check.copied)}
+        self.check.look(self.numbers - missing, begun, self._agrees, run)
         return missing | self.check.stale
 
     def _agrees(self, number: int) -> bool | None:
         """Return whether a frame is equal to what is made now; None if it cannot be made."""
         (task,) = self.tasks({number})
-        made, own = task.run().outputs, f"{self.plan.grid}/"
+        made = task.run().outputs
+        own = f"{self.plan.grid}/"
         fields = {name: array for name, array in made.items() if name.startswith(own)}
         return (
             None
@@ -650,7 +657,8 @@ class SequenceJob:
 
     def is_reported(self) -> bool:
         """Whether the report covers all frames, and its text files are those of now."""
-        report, now = self.report(), self._documents()
+        report = self.report()
+        now = self._documents()
         return (
             report is not None
             and not self.check.changed
@@ -818,7 +826,8 @@ def _batches(job: SequenceJob, tasks: Series[FrameTask], spread: Run) -> Iterato
     other, as long as it writes them itself.
     """
     groups = groupby(tasks, key=lambda task: job.block_of(task.number))
-    blocks, together = [tuple(group) for _, group in groups], 1
+    blocks = [tuple(group) for _, group in groups]
+    together = 1
     shares = isinstance(job.plan.observe, FromScans) and job.writer.concurrent
     if shares and not spread.is_alone:
         rounds = max(round(len(tasks) / (_TOGETHER * spread.processes)), 1)

@@ -119,7 +119,9 @@ def see_voxels(
 @cached
 def _mark_seen(voxels, eye, solid, bit, seen):  # type: ignore[no-untyped-def]
     """Set a bit of the voxels that rays from an eye reach. Everything is in units of voxels."""
-    size, boxes, middle = solid.size, solid.boxes, np.empty(3)
+    size = solid.size
+    boxes = solid.boxes
+    middle = np.empty(3)
     for voxel in voxels:
         cell = voxel // (size[2] * size[1]), (voxel // size[2]) % size[1], voxel % size[2]
         reached = _reaches((cell[0] + 0.5, cell[1] + 0.5, cell[2] + 0.5), eye, cell, solid)
@@ -175,7 +177,9 @@ def _reach_points(points, eye, solid, reached):  # type: ignore[no-untyped-def]
             at_x = points[n, 0]
             at_y = points[n, 1]
             at_z = points[n, 2] + raised
-            ray_x, ray_y, ray_z = eye[0] - at_x, eye[1] - at_y, eye[2] - at_z
+            ray_x = eye[0] - at_x
+            ray_y = eye[1] - at_y
+            ray_z = eye[2] - at_z
             far = max(abs(ray_x), abs(ray_y), abs(ray_z))
             # from this share of the ray on, voxels hide the point
             first = 1.0 if far <= _BESIDE else _BESIDE / far
@@ -194,7 +198,7 @@ def _reach_points(points, eye, solid, reached):  # type: ignore[no-untyped-def]
             x = int(np.floor(at_x))
             y = int(np.floor(at_y))
             z = int(np.floor(at_z))
-            is_outside = x < 0 or y < 0 or z < 0 or x >= size[0] or y >= size[1] or z >= size[2]
+            is_outside = _is_outside(x, y, z, size)
             if first >= 1.0 or is_outside or _reaches((at_x, at_y, at_z), eye, (x, y, z), solid):
                 reached[n] = True
                 break
@@ -203,48 +207,46 @@ def _reach_points(points, eye, solid, reached):  # type: ignore[no-untyped-def]
 @jit
 def _reaches(at, eye, cell, solid):  # type: ignore[no-untyped-def]
     """Return whether no obstacle lies between a position in a voxel and the eye."""
-    size, (x, y, z) = solid.size, cell
-    ray = ray_x, ray_y, ray_z = eye[0] - at[0], eye[1] - at[1], eye[2] - at[2]
-    step_x, step_y, step_z = (
-        (1 if ray_x > 0 else -1),
-        (1 if ray_y > 0 else -1),
-        (1 if ray_z > 0 else -1),
-    )
-    each_x = abs(1.0 / ray_x) if ray_x != 0 else np.inf
-    each_y = abs(1.0 / ray_y) if ray_y != 0 else np.inf
-    each_z = abs(1.0 / ray_z) if ray_z != 0 else np.inf
-    next_x = (x + (ray_x > 0) - at[0]) / ray_x if ray_x != 0 else np.inf
-    next_y = (y + (ray_y > 0) - at[1]) / ray_y if ray_y != 0 else np.inf
-    next_z = (z + (ray_z > 0) - at[2]) / ray_z if ray_z != 0 else np.inf
-    while True:
+    size = solid.size
+    x, y, z = cell
+    ray = eye[0] - at[0], eye[1] - at[1], eye[2] - at[2]
+    step_x, each_x, next_x = _steps(at[0], ray[0], x)
+    step_y, each_y, next_y = _steps(at[1], ray[1], y)
+    step_z, each_z, next_z = _steps(at[2], ray[2], z)
+    while min(next_x, next_y, next_z) < 1.0:
         if next_x <= next_y and next_x <= next_z:
-            if next_x >= 1.0:
-                return True
             x += step_x
             next_x += each_x
-            if x < 0 or x >= size[0]:
-                return True
         elif next_y <= next_z:
-            if next_y >= 1.0:
-                return True
             y += step_y
             next_y += each_y
-            if y < 0 or y >= size[1]:
-                return True
         else:
-            if next_z >= 1.0:
-                return True
             z += step_z
             next_z += each_z
-            if z < 0 or z >= size[2]:
-                return True
+        if _is_outside(x, y, z, size):
+            return True
         voxel = (x * size[1] + y) * size[2] + z
-        if solid.occupied[voxel]:
-            # the voxel of the eye itself stops no ray
-            if next_x >= 1.0 and next_y >= 1.0 and next_z >= 1.0:
-                return True
-            if _is_stopped(at, ray, (x, y, z), voxel, solid):
-                return False
+        if not solid.occupied[voxel] or min(next_x, next_y, next_z) >= 1.0:
+            continue  # the voxel of the eye itself stops no ray
+        if _is_stopped(at, ray, (x, y, z), voxel, solid):
+            return False
+    return True
+
+
+@jit
+def _steps(at, ray, cell):  # type: ignore[no-untyped-def]
+    """Return how a ray steps from voxel to voxel along an axis: in which direction, how much of the
+    ray each step takes, and how much lies before the first one.
+    """
+    if ray == 0:
+        return 1, np.inf, np.inf
+    return (1 if ray > 0 else -1), abs(1.0 / ray), (cell + (ray > 0) - at) / ray
+
+
+@jit
+def _is_outside(x, y, z, size):  # type: ignore[no-untyped-def]
+    """Return whether a cell is not in the grid."""
+    return x < 0 or y < 0 or z < 0 or x >= size[0] or y >= size[1] or z >= size[2]
 
 
 @jit
@@ -252,13 +254,16 @@ def _is_stopped(at, ray, cell, voxel, solid):  # type: ignore[no-untyped-def]
     """Return whether an occupied voxel, or the box around its points if they are known, stops a ray
     through the voxel.
     """
-    boxes, first, last = solid.boxes, 0.0, 1.0
+    boxes = solid.boxes
+    first = 0.0
+    last = 1.0
     if not len(boxes) or boxes[voxel, 0] > boxes[voxel, 3]:
         return True
     for axis in range(3):
         low = cell[axis] + boxes[voxel, axis] / STEPS - solid.beyond[axis] - at[axis]
         high = cell[axis] + (1.0 + boxes[voxel, 3 + axis]) / STEPS + solid.beyond[axis] - at[axis]
-        enter, leave = low / ray[axis], high / ray[axis]
+        enter = low / ray[axis]
+        leave = high / ray[axis]
         first = max(first, min(enter, leave))
         last = min(last, max(enter, leave))
     return first < last

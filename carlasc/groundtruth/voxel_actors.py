@@ -66,7 +66,8 @@ class VoxelActors:
         fast = np.flatnonzero(np.square(velocity).sum(axis=1) > MIN_SPEED_M_S**2)
         fast = fast[np.argsort(voxels[fast], kind="stable")]
         table = np.empty(len(fast), VELOCITY_DTYPE)
-        table["voxel"], table["velocity"] = voxels[fast], velocity[fast]
+        table["voxel"] = voxels[fast]
+        table["velocity"] = velocity[fast]
         return cls(instance.reshape(spec.size), table)
 
     def within(self, occupied: BoolArray) -> Self:
@@ -88,7 +89,9 @@ class ActorPoints:
     def __init__(
         self, spec: GridSpec, turns: Mapping[int, float], deformable: Collection[int]
     ) -> None:
-        self.spec, self.turns, self.deformable = spec, turns, deformable
+        self.spec = spec
+        self.turns = turns
+        self.deformable = deformable
         self._counts = np.empty(0, _POINTS_DTYPE)
         self._velocity: dict[int, FloatArray] = {}
         # bounds in x, y of turning actors
@@ -103,11 +106,9 @@ class ActorPoints:
         voxels = self.spec.flat_index(points)
         used = (voxels >= 0) & (scan.labels > 0)
         rows = np.empty(np.count_nonzero(used), _POINTS_DTYPE)
-        rows["voxel"], rows["label"], rows["actor"] = (
-            voxels[used],
-            scan.labels[used],
-            scan.instances[used],
-        )
+        rows["voxel"] = voxels[used]
+        rows["label"] = scan.labels[used]
+        rows["actor"] = scan.instances[used]
         rows["points"] = 1
         self._counts = _sum(np.concatenate([self._counts, _sum(rows)]))
         velocity = rotate_vectors(grid_T_sensor, recording.velocities[:, 1:])
@@ -196,7 +197,8 @@ def number_actors(tracks: Mapping[int, Track], highest: int = 0) -> dict[int, in
         for other in order[row + 1 :]:
             if tracks[other].first > end - _FEWEST_COMMON:
                 break
-            first, second = root(one), root(other)
+            first = root(one)
+            second = root(other)
             may_join = first != second and not (first in numbers and second in numbers)
             if may_join and _are_one(tracks[one], tracks[other]):
                 kept, joined = (second, first) if second in numbers else (first, second)
@@ -234,7 +236,8 @@ def _are_one(one: Track, other: Track) -> bool:
     poses = (
         track.world_T_actor[begin - track.first : end - track.first] for track in (large, small)
     )
-    large_T_world, world_T_small = invert(next(poses)), next(poses)
+    large_T_world = invert(next(poses))
+    world_T_small = next(poses)
     # not of the completed body, whose position is uncertain
     seen = (small.extent.lower + small.extent.upper) / 2
     middle = multiply(large_T_world, world_T_small, np.append(seen, 1.0)[:, None])[:, :3, 0]

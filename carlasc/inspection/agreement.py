@@ -167,7 +167,8 @@ class GridEvidence:
         about = (points[chosen], grid.spec, grid.labels, grid.known)
         as_is, *shifted = labels_at(*about, shifts=_SHIFTED)
         at_points = np.stack([as_is, *labels_at(*about, warps=_TURNED), *shifted])
-        known, occupied = at_points >= 0, at_points > 0
+        known = at_points >= 0
+        occupied = at_points > 0
         counted = known.sum(axis=1)
         if counted[: 1 + len(_AXES)].max() < _MIN_POINTS:
             return
@@ -186,7 +187,8 @@ class GridEvidence:
         """
         if not self._right:
             return GridDiagnosis(float("nan"), float("nan"), 0)
-        right, known = np.stack(self._right), np.stack(self._known)
+        right = np.stack(self._right)
+        known = np.stack(self._known)
         shares = right / known.max(axis=1, keepdims=True)
         means = shares.mean(axis=0)
         chance = 3 * float(np.sqrt(max(means[0] * (1 - means[0]), 1e-4) / known.max(axis=1).sum()))

@@ -33,7 +33,9 @@ from carlasc.storage.protocol import Sequence
 
 MIN_RANGE_M = 3.0
 MAX_RANGE_M = 30.0
-_INDOORS_M, _NEAR_M = 1.0, 5.0  # nearest points indoors: where half of them are so near
+# nearest points indoors: where half of them are so near
+_INDOORS_M = 1.0
+_NEAR_M = 5.0
 _STANDS_M_S = 0.1  # slower points stand
 _COLUMN_M = 0.4
 _UPRIGHT_M = 0.6  # points in a column that spans less height are ground
@@ -194,6 +196,7 @@ _EXPLAINED = 0.2  # and the mean share must be at least this then
 # traffic, without labels, the share grows by a factor of 1.4; it grows by at least 1.8 if the scans
 # really are in one frame.
 _STANDING = 1.6
+_PAIRS = 24  # of scans, which are compared
 _RARE = 0.02  # a rare mistake must raise the mean by this more than a common one
 _CLEAR_OFFSET = 0.1  # an offset must raise the share by this
 
@@ -250,7 +253,6 @@ def diagnose_poses(
     *,
     points: Callable[[int], AnyFloatArray] | None = None,
     seconds: FloatArray | None = None,
-    max_pairs: int = 24,
 ) -> PoseDiagnosis:
     """Measure the overlap of scans under their poses, and under the poses with each known mistake
     corrected.
@@ -262,16 +264,18 @@ def diagnose_poses(
         points: returns (N, 3) all points of the i-th scan on static things; None takes its
             structure.
         seconds: (F,) times of the scans, increasing; None for frames at 10 Hz.
-        max_pairs: largest number of pairs of scans that are compared.
     """
     corrections = known_corrections()
     corrected = [poses, *(correction.undo(poses) for correction in corrections)]
-    overlaps, shares, judged = [], [], []
-    chosen = choose_pairs(poses, max_pairs)
+    overlaps = []
+    shares = []
+    judged = []
+    chosen = choose_pairs(poses)
     # Pairs are in the order of time, so that a scan is read once although it is in several pairs.
     recent = lru_cache(2 * _REACH)(structure)
     for earlier, later in chosen:
-        target, source = recent(earlier), recent(later)
+        target = recent(earlier)
+        source = recent(later)
         moved = _thin(source, _MAX_POINTS)
         if min(len(target), len(moved)) < _MIN_POINTS:
             continue
@@ -309,14 +313,22 @@ REACH_M = 3.0
 _LONG_PAIRS = 12
 # Scans over this distance overlap by at least a share, or by as much of the share of neighbours:
 # where a motion is missing in the poses, they do not.
-_LEAST, _ALIKE, _ENOUGH = 0.25, 0.62, 0.5
+_LEAST = 0.25
+_ALIKE = 0.62
+_ENOUGH = 0.5
 # surfaces of one scan: size of the cells, least points, thickness, flatness, width
-_WALL_M, _WALL_POINTS, _THIN_M2, _FLAT, _WIDE_M2 = 1.0, 12, 0.06**2, 0.02, 0.02
+_WALL_M = 1.0
+_WALL_POINTS = 12
+_THIN_M2 = 0.06**2
+_FLAT = 0.02
+_WIDE_M2 = 0.02
 # A position is determined where scans overlap less if they are moved by these distances: by any
 # factor where this share of the surfaces faces the direction, else by a factor; by a larger one
 # where the sensor stands, as the rays of a scan then end where those of the scan before ended.
 _SHIFTS_M = VOXEL_M * np.array([-4, -3, -2, -1, 1, 2, 3, 4])
-_FACING, _MOVED, _STOOD = 0.012, 1.05, 1.25
+_FACING = 0.012
+_MOVED = 1.05
+_STOOD = 1.25
 
 
 @dataclass(frozen=True)
@@ -364,7 +376,8 @@ def measure_overlap(
         points: returns all (N, 3) points of the i-th scan.
         poses: (F, 4, 4) first_T_sensor of each scan, in order of time; rigid.
     """
-    pairs, facing = [], np.zeros((2, 2))
+    pairs = []
+    facing = np.zeros((2, 2))
     for first in np.unique(np.linspace(0, len(poses) - 2, _LONG_PAIRS).astype(int)).tolist():
         away = np.linalg.norm(poses[first:, :3, 3] - poses[first, :3, 3], axis=1) > REACH_M
         last = first + int(away.argmax()) if away.any() else len(poses) - 1
@@ -372,7 +385,8 @@ def measure_overlap(
         moved = _thin(structure(last), _OFFSET_POINTS)
         if min(len(target), len(moved)) < _MIN_POINTS:
             continue
-        here, motion = poses[first : first + 1], relative(poses, first, last)
+        here = poses[first : first + 1]
+        motion = relative(poses, first, last)
         pairs.append((occupancy(target), motion, moved, here[0, :2, :3]))
         (block,) = blocks([target.astype(np.float32)], here, _WALL_M, shift=0.0)
         _, spread = spread_of(block, here, 1)
@@ -384,7 +398,9 @@ def measure_overlap(
     if not pairs:
         return LongOverlap(math.nan)
     ways, directions = np.linalg.eigh(facing)
-    way, shares, along = directions[:, 0], [], []
+    way = directions[:, 0]
+    shares = []
+    along = []
     for occupied, motion, moved, first_T_here in pairs:
         step = way @ first_T_here
         shares.append(
@@ -401,20 +417,18 @@ def measure_overlap(
     return LongOverlap(own, open_way, measure_drift(points, poses))
 
 
-def choose_pairs(poses: Poses, max_pairs: int) -> list[tuple[int, int]]:
+def choose_pairs(poses: Poses) -> list[tuple[int, int]]:
     """Choose pairs of scans some metres apart: half of them spread over the drive, half where the
     sensor turns most.
     """
     if len(poses) < 2:
         return []
     candidates = [(first, _partner(poses, first)) for first in range(len(poses) - 1)]
-    spread = {
-        candidates[i] for i in np.linspace(0, len(candidates) - 1, (max_pairs + 1) // 2).astype(int)
-    }
+    spread = {candidates[i] for i in np.linspace(0, len(candidates) - 1, _PAIRS // 2).astype(int)}
     turns = angles_of(np.stack([relative(poses, *pair) for pair in candidates]))
     turning = [candidates[i] for i in np.argsort(turns)[::-1] if candidates[i] not in spread]
     # neighbouring pairs are in the same turn, so only every third of the sharpest is taken
-    return sorted(spread | set(turning[: 3 * (max_pairs // 2) : 3]))
+    return sorted(spread | set(turning[: 3 * (_PAIRS // 2) : 3]))
 
 
 def known_corrections() -> tuple[Correction, ...]:
@@ -452,12 +466,11 @@ def known_corrections() -> tuple[Correction, ...]:
     known = (np.eye(3), mirrored, *cameras, *mirrored_cameras)
     for names, matrix in choices_of_axes():
         if not any(np.array_equal(matrix, other) for other in known):
-            kind, advice = (
-                "poses in other axes than the scans",
-                "convert them to the axes of the scans",
-            )
+            kind = "poses in other axes than the scans"
+            advice = "convert them to the axes of the scans"
             if names[-1] == "x":
-                kind, advice = "camera-frame poses", camera_advice
+                kind = "camera-frame poses"
+                advice = camera_advice
             name = f"{kind} (x, y, z are {names})"
             corrections.append(replace(_of_axes(name, advice, matrix), rare=True))
     standing = Correction(
@@ -498,8 +511,10 @@ def _best_correction(
         The column of the best correction, and the mean shares without and with it on the pairs on
         which it makes a difference; None if none is clearly better than the poses as they are.
     """
-    gains, mean = shares - shares[:, :1], shares.mean(axis=0)
-    gain, error = gains.mean(axis=0), gains.std(axis=0) / np.sqrt(len(gains))
+    gains = shares - shares[:, :1]
+    mean = shares.mean(axis=0)
+    gain = gains.mean(axis=0)
+    error = gains.std(axis=0) / np.sqrt(len(gains))
     factors = np.array([1.0, *(correction.factor for correction in corrections)])
     rare = np.array([False, *(correction.rare for correction in corrections)])
     wins = ((gains > 0) & judged).sum(axis=0) >= _WINS * judged.sum(axis=0)
@@ -512,7 +527,8 @@ def _best_correction(
     if not clear.any():
         return None
     best = int(np.where(clear, mean / factors - _RARE * rare, -np.inf).argmax())
-    own, corrected = shares[judged[:, best], 0], shares[judged[:, best], best]
+    own = shares[judged[:, best], 0]
+    corrected = shares[judged[:, best], best]
     return best, float(own.mean()), float(corrected.mean())
 
 
@@ -527,9 +543,11 @@ def _common_offset(
             pair, and earlier_T_later.
     """
     steps = np.array(list(itertools.product(range(-6, 7), range(-6, 7), (-1, 0, 1)))) * VOXEL_M
-    offsets, chosen = [], overlaps[:: max(1, len(overlaps) // _OFFSET_PAIRS)]
+    offsets = []
+    chosen = overlaps[:: max(1, len(overlaps) // _OFFSET_PAIRS)]
     for target, later, motion in chosen:
-        occupied, moved = occupancy(target), transform_points(motion, later)
+        occupied = occupancy(target)
+        moved = transform_points(motion, later)
         shares = np.array([overlap(occupied, translation(step), moved) for step in steps])
         if shares.max() > shares[len(steps) // 2] + _CLEAR_OFFSET:
             offsets.append((-steps[shares.argmax()], motion[:3, 3]))

@@ -56,7 +56,8 @@ def draw_histograms(statistics: Statistics, plot: Path) -> None:
     """
     figures = check_plot(plot)
     splits = statistics.by_split()
-    names, colors = statistics.classes.names, statistics.classes.palette / 255
+    names = statistics.classes.names
+    colors = statistics.classes.palette / 255
     ids = [
         i
         for i in names

@@ -30,7 +30,8 @@ Arrays = Mapping[str, AnyArray]
 
 def check_documents(sequence: Sequence) -> Iterator[Finding]:
     """Check carlasc.json and the params.json of each grid, and that the sequence holds data."""
-    where, described = sequence.location, True
+    where = sequence.location
+    described = True
     try:
         _ = sequence.metadata
     except CarlascError as error:
@@ -101,11 +102,13 @@ def check_documents(sequence: Sequence) -> Iterator[Finding]:
 
 def check_frames(sequence: Sequence) -> Iterator[Finding]:
     """Check that frame numbers have no gaps, and that no field lacks frames or has more."""
-    fields, frames = sequence.fields(), sequence.scan_frames()
+    fields = sequence.fields()
+    frames = sequence.scan_frames()
     gaps = np.flatnonzero(np.diff(frames) > 1)
     if len(gaps):
         missing = int((np.diff(frames)[gaps] - 1).sum())
-        first, then = frames[gaps[0]], frames[gaps[0] + 1]
+        first = frames[gaps[0]]
+        then = frames[gaps[0] + 1]
         yield Finding(
             # Grids are often made for every fifth frame only; gaps between scans are rarely meant.
             "warning" if "points" in fields else "note",
@@ -189,7 +192,8 @@ def check_values(sequence: Sequence, frame: int) -> Iterator[Finding]:
             arrays[name] = sequence.read(name, frame)
     table = sequence.metadata.classes
     for name in sorted(layout.SCAN_FIELDS.keys() & arrays.keys()):
-        kind, array = layout.SCAN_FIELDS[name].kind, arrays[name]
+        kind = layout.SCAN_FIELDS[name].kind
+        array = arrays[name]
         where = _file(sequence, name, frame)
         if array.dtype.kind == "f":
             yield from _check_numbers(name, array, where)

@@ -64,11 +64,14 @@ class Finding:
             error: its parts become the parts of the finding.
             advice: for an error without advice.
         """
-        expected, found, where = error.expected, error.found, error.where
+        expected = error.expected
+        found = error.found
+        where = error.where
         if error.problem:
             found = f"{error.problem}: {found}" if expected else error.problem
         elif not expected:  # all that the error says is in its first part
-            found, where = where, location
+            found = where
+            where = location
         expected = expected or "data that can be read"
         return cls("error", check, where, expected, found, error.advice or advice)
 

@@ -41,7 +41,10 @@ from carlasc.storage.protocol import Sequence, Source
 
 EVERY = 10
 """Default of `every`: every tenth scan is left out."""
-_FREE, _PASSED, _SWEPT = 0.02, 0.35, 0.25  # greatest shares of grids that are right
+# greatest shares of grids that are right
+_FREE = 0.02
+_PASSED = 0.35
+_SWEPT = 0.25
 _RETURNS = 1000  # fewer returns within the grid tell nothing
 # a frame is measured if its window has this share of the scans of a whole window
 _NEARLY_WHOLE = 0.8
@@ -163,7 +166,8 @@ def holdout(
     """
     start = time.perf_counter()
     existing, made = _existing_grid(as_source(source))
-    spec, observe = spec or existing, observe or made
+    spec = spec or existing
+    observe = observe or made
     if every < 2:
         raise ArgumentError("every", expected="2 or more", found=every)
     check_cartesian(spec)
@@ -273,7 +277,8 @@ _Task = tuple[ScanFrame, Sequence, GridPlan]
 def _measure(task: _Task) -> HeldOutScores | str:
     """Measure one frame, in a worker; return why it failed if it did."""
     others, whole, plan = task
-    feed, frame = others.inputs.feed, others.number
+    feed = others.inputs.feed
+    frame = others.number
     try:
         window = [other for other in feed.window_of(frame) if other != frame]
         if not window:

@@ -33,9 +33,12 @@ VEHICLE_M = ((-2.2, -0.75, -1.2), (2.2, 0.75, 0.0))
 sensor (x forward), metres.
 """
 
-_SOLID, _OBJECT = 1, 2  # bits of a voxel: it is occupied; its class is not ground
+# bits of a voxel: it is occupied; its class is not ground
+_SOLID = 1
+_OBJECT = 2
 # histogram of the errors of the first hit; the last bin holds all larger ones
-_STEP_M, _STEPS = 0.02, 500
+_STEP_M = 0.02
+_STEPS = 500
 
 
 @dataclass(frozen=True)
@@ -130,7 +133,8 @@ class HeldOutScores:
         Raises:
             ArgumentError: the grid is cylindrical.
         """
-        spec, occupied = grid.spec, grid.known & (grid.labels != 0)
+        spec = grid.spec
+        occupied = grid.known & (grid.labels != 0)
         if labels is None:
             ground = lowest_of_columns(occupied)
             kinds = np.full(len(points), classes.geometry_id)
@@ -148,7 +152,8 @@ class HeldOutScores:
         at_points = at_points[inside]
         missed = np.isinf(first)
         cells = kinds[inside], np.searchsorted(BANDS_M, ranges, side="right") - 1
-        free, unknown = at_points == 0, at_points == UNKNOWN
+        free = at_points == 0
+        unknown = at_points == UNKNOWN
         columns = (free | True, free, unknown, passed != 0, passed & _OBJECT != 0, missed)
         scores = cls.empty(classes)
         np.add.at(scores.counts, cells, np.column_stack(columns))
@@ -296,7 +301,8 @@ def _follow(
     there are few different ones.
     """
     order = sorted_by_origin(origins)
-    first, passed = np.empty(len(points)), np.empty(len(points), np.uint8)
+    first = np.empty(len(points))
+    passed = np.empty(len(points), np.uint8)
     for part, origin in runs_of_origins(origins[order], len(points)):
         rows = order[part]
         first[rows], passed[rows] = follow_rays(solid, spec, origin, points[rows])

@@ -28,14 +28,19 @@ UNDETERMINED = "undetermined"
 _FRAMES = 9  # that are looked at
 _BAND_PX = 4.0  # height of the rows of an image in which points are neighbours
 _NEAR_PX = 14.0  # between points that are neighbours
-_JUMP, _JUMP_M = 0.25, 2.0  # by which the depth jumps: share, and metres
+# by which the depth jumps: share, and metres
+_JUMP = 0.25
+_JUMP_M = 2.0
 _SHIFTS_PX = np.arange(-20, 21)
 _TIMES_S = np.arange(-0.15, 0.1501, 0.01)
 _LEAST = 25.0  # contrast in sum
 _CLEAR = 3.0  # standard deviations by which the best shift is better than others
 _ALONE = 1.5  # times as high as any other, from the mean: fences fit in several places
-_MOVED_M, _TURNED = 0.5, 0.02  # less motion in these times says nothing of them
-_WRONG_PX, _WRONG_S = 4.0, 0.05
+# less motion in these times says nothing of them
+_MOVED_M = 0.5
+_TURNED = 0.02
+_WRONG_PX = 4.0
+_WRONG_S = 0.05
 
 
 @dataclass(frozen=True)
@@ -154,7 +159,8 @@ class _View:
         if {layout.POSES, layout.TIMES} <= set(sequence.documents()) and len(sequence.times) == len(
             sequence.poses
         ) > 1:
-            times, now = sequence.times, sequence.read_time(frame)
+            times = sequence.times
+            now = sequence.read_time(frame)
             then = (now + _TIMES_S).clip(times[0], times[-1])
             moved = invert(sequence.read_pose(frame)) @ slerp(sequence.poses, times, then)
         apart = np.abs(moved[-1, :3] - moved[0, :3])
@@ -188,10 +194,13 @@ def _depth_edges(camera: CameraModel, points: FloatArray) -> FloatArray:
     """
     pixels = camera.project(points)
     seen = camera.contains(pixels)
-    pixels, depth = pixels[seen], points[seen, 2]
+    pixels = pixels[seen]
+    depth = points[seen, 2]
     band = pixels[:, 1] // _BAND_PX
     order = np.lexsort((pixels[:, 0], band))
-    pixels, depth, band = pixels[order], depth[order], band[order]
+    pixels = pixels[order]
+    depth = depth[order]
+    band = band[order]
     near = np.minimum(depth[1:], depth[:-1])
     jumps = np.abs(np.diff(depth)) > np.maximum(_JUMP_M, _JUMP * near)
     edge = jumps & (np.diff(band) == 0) & (np.diff(pixels[:, 0]) < _NEAR_PX)
@@ -209,7 +218,8 @@ def _clearest(values: AnyArray, thirds: list[FloatArray], apart: float) -> float
     best = int(total.argmax())
     elsewhere = np.abs(np.arange(len(values)) - best) > len(values) // 6
     usual = total[elsewhere].mean()
-    above, others = total[best] - usual, total[elsewhere] - usual
+    above = total[best] - usual
+    others = total[elsewhere] - usual
     agree = all(abs(values[int(third.argmax())] - values[best]) <= apart for third in thirds)
     is_clear = above > _CLEAR * float(others.std()) and above > _ALONE * float(others.max())
     return float(values[best]) if agree and is_clear and 0 < best < len(values) - 1 else None

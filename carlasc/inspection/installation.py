@@ -261,7 +261,8 @@ def _problems_of_import(name: str) -> Iterator[str]:
 
 
 def _look_at_processor(numba_loads: bool) -> Processor:
-    target, features = "", tuple[str, ...]()
+    target = ""
+    features = tuple[str, ...]()
     if numba_loads:
         binding: Any = importlib.import_module("llvmlite.binding")
         config: Any = importlib.import_module("numba").config

@@ -241,7 +241,8 @@ def _describe(sequence: Sequence) -> SequenceOverview:
     fields = {name: len(sequence.frames(name)) for name in sorted(sequence.fields())}
     numbers = set[int]().union(*(sequence.frames(name).tolist() for name in fields))
     frames = np.array(sorted(numbers), np.int64)
-    metadata, problem = Metadata(), None
+    metadata = Metadata()
+    problem = None
     grids: tuple[GridOverview, ...] = ()
     try:
         metadata = sequence.metadata

@@ -30,7 +30,8 @@ quality of grids.
 
 _RUN = 30  # scans of a run
 # frames by which poses are moved for another start, which must be better by this factor
-_SHIFTS, _BETTER = ((-2, 2), 0.9)
+_SHIFTS = (-2, 2)
+_BETTER = 0.9
 _AGREE_M = 0.03  # scans that agree within this distance are aligned
 
 
@@ -53,7 +54,8 @@ class PoseQuality:
     @property
     def is_poor(self) -> bool:
         """Whether neighbouring scans would agree clearly better under other poses."""
-        before, after = self.disagreement_m, self.refined_m
+        before = self.disagreement_m
+        after = self.refined_m
         return before is not None and after is not None and before > max(POOR_M, 1.5 * after)
 
 
@@ -95,7 +97,8 @@ def measure_poses(
             other = align(used, start, start)
             other_now = finite_mean(disagreement(measured, other))
             if other_now < _BETTER * now:
-                aligned, now = other, other_now
+                aligned = other
+                now = other_now
         before.append(was)
         after.append(now)
         if now <= _AGREE_M:
@@ -113,8 +116,11 @@ def describe_mounting(mounting: Mounting) -> tuple[str, str] | None:
     """Return a description of poses with this mounting and an advice, for a message; None if they
     need no correction.
     """
-    wrong, values, errors = mounting.wrong, mounting.values, mounting.errors
-    described, advice = [], "write corrected poses with `carlasc refine`"
+    wrong = mounting.wrong
+    values = mounting.values
+    errors = mounting.errors
+    described = []
+    advice = "write corrected poses with `carlasc refine`"
     said = list(mounting.describe().items())
     if wrong[:3].any():
         place = ", ".join(f"{axis} = {value}" for axis, value in said[:3])
@@ -130,7 +136,8 @@ def describe_mounting(mounting: Mounting) -> tuple[str, str] | None:
         described.append(f"poses in whose frame the sensor is turned by {turned}")
         advice = f"check the rotation of the calibration, which no command changes; {advice}"
     if wrong[6]:
-        when, late_s = "late" if values[6] > 0 else "early", abs(values[6])
+        when = "late" if values[6] > 0 else "early"
+        late_s = abs(values[6])
         described.append(
             f"poses that are {late_s:.2f} ± {errors[6]:.2f} s {when} "
             f"({late_s / layout.FRAME_PERIOD_S:.1f} frames)"
@@ -239,7 +246,8 @@ def _check_lines(sequence: Sequence, kind: str, where: str, lines: int) -> Itera
     if not len(frames):
         return
     last = int(frames[-1])
-    expected, found = f"{last + 1} lines, up to frame {last}", f"{lines} lines"
+    expected = f"{last + 1} lines, up to frame {last}"
+    found = f"{lines} lines"
     if not _has_lines(sequence, lines):
         if last + 1 != len(frames):
             expected += f" (or {len(frames)}, one per frame that exists)"
@@ -295,11 +303,14 @@ def describe_jumps(frames: IntArray, poses: FloatArray, seconds: FloatArray) -> 
         poses: (F, 4, 4) their poses.
         seconds: (F,) their times; if they do not increase, frames at 10 Hz are taken.
     """
-    steps, period_s = invert(poses[:-1]) @ poses[1:], np.diff(seconds)
+    steps = invert(poses[:-1]) @ poses[1:]
+    period_s = np.diff(seconds)
     if not (period_s > 0).all():  # which is reported elsewhere
         period_s = np.diff(frames) * layout.FRAME_PERIOD_S
-    moved_m, turned = np.linalg.norm(steps[:, :3, 3], axis=1), angles_of(steps)
-    speed, turn = moved_m / period_s, turned / period_s
+    moved_m = np.linalg.norm(steps[:, :3, 3], axis=1)
+    turned = angles_of(steps)
+    speed = moved_m / period_s
+    turn = turned / period_s
     usual = np.array([np.median(speed[max(0, i - 3) : i + 4]) for i in range(len(speed))])
     strange = np.abs(speed - usual)
     jumps = np.flatnonzero(

@@ -25,7 +25,9 @@ from carlasc.motion.tracks import is_doubtful
 from carlasc.storage.files import write_output
 from carlasc.storage.resuming import RECORD
 
-_BAR, _ROW = "#3566a8", 18  # colour of a bar, and the height of a row in pixels
+# colour of a bar, and the height of a row in pixels
+_BAR = "#3566a8"
+_ROW = 18
 
 
 def write_report_page(result: ReportResult, out: str | Path) -> None:
@@ -106,7 +108,8 @@ def _poses(facts: PoseFacts) -> str:
 
 
 def _held_out(values: Mapping[str, Any]) -> str:
-    rays, swept = values["rays"], values["swept"]["occupied_share"]
+    rays = values["rays"]
+    swept = values["swept"]["occupied_share"]
     if not rays["returns"]:
         return "none"
     text = (
@@ -122,16 +125,19 @@ def _held_out(values: Mapping[str, Any]) -> str:
 
 
 def _section(name: str, report: Report) -> str:
-    coverage, known = report.coverage, max(report.coverage.known, 1)
+    coverage = report.coverage
+    known = max(report.coverage.known, 1)
     classes = sorted(
         ((label, count / known) for label, count in coverage.classes.items()),
         key=lambda pair: -pair[1],
     )
     votes = [(_bin_name(power), count / known) for power, count in enumerate(coverage.votes)]
-    spec, frames = GridSpec.from_params(report.settings, name), report.frames
+    spec = GridSpec.from_params(report.settings, name)
+    frames = report.frames
     digests = {field: digest.all for field, digest in report.digests.items()}
     digests |= {field: digest.digest for field, digest in report.documents.items()}
-    held_out, actors = "", ""
+    held_out = ""
+    actors = ""
     if report.holdout and report.holdout["by_distance"]:
         held_out = _part("Held-out rays", _held_out_table(report.holdout))
     if report.actors:
@@ -202,7 +208,8 @@ def _timeline(actors: Sequence[ActorTrack], frames: Sequence[int]) -> str:
         name = f"{actor.label} {actor.instance or ''}".strip()
         length = actor.last - actor.first
         opacity = f' fill-opacity="{actor.observations / (length + 1):.2f}"'
-        x, width = 130 + (actor.first - first) * scale, max(length * scale, 2)
+        x = 130 + (actor.first - first) * scale
+        width = max(length * scale, 2)
         lines += _bar(row, name, x, width, opacity)
     axis = len(actors) * _ROW + 14
     lines += [f'<text x="130" y="{axis}">{first}</text>', f'<text x="680" y="{axis}">{last}</text>']

@@ -180,7 +180,8 @@ class _ReportMaker:
     """Makes the report of one grid of one sequence."""
 
     def __init__(self, sequence: Sequence, grid: str) -> None:
-        self.sequence, self.grid = sequence, grid
+        self.sequence = sequence
+        self.grid = grid
         self.frames: list[int] = sequence.frames(f"{grid}/labels").tolist()
 
     @cached_property
@@ -195,13 +196,15 @@ class _ReportMaker:
 
     def make(self, run: Run, steps: StepCounter) -> tuple[Report, list[FrameFailure]]:
         """Measure the frames, and make the report; return also the frames that cannot be read."""
-        sequence, inputs = self.sequence, self.inputs
+        sequence = self.sequence
+        inputs = self.inputs
         try:
             if inputs is not None:
                 inputs.prepare(None, run, steps)
         except (CarlascError, OSError):  # the error is reported when the frame is measured
             self.inputs = inputs = None
-        facts, failures = list[FrameFacts](), list[FrameFailure]()
+        facts = list[FrameFacts]()
+        failures = list[FrameFailure]()
         with closing(run_all(_measure, self._tasks(), run, lost=_fail)) as results:
             for result in results:
                 if isinstance(result, FrameFacts):
@@ -302,7 +305,9 @@ def _options_of(record: Mapping[str, Any]) -> FromScans:
 
 def _measure(task: _ReportedFrame) -> FrameFacts | FrameFailure:
     """Measure one frame; return why it failed if it did."""
-    sequence, number, grid = task.sequence, task.number, task.grid
+    sequence = task.sequence
+    number = task.number
+    grid = task.grid
     names = (*layout.SCAN_FIELDS, *(f"{grid}/{part}" for part in layout.GRID_FIELDS))
     try:
         present = sequence.fields()
@@ -311,7 +316,6 @@ def _measure(task: _ReportedFrame) -> FrameFacts | FrameFailure:
             for n in names
             if n in present and number in sequence.frames(n)
         }
-        spec = sequence.grids[grid]
         classes = sequence.classes_of(grid)
         changes = None
         residuals = None if task.scans is None else task.scans.residuals()
@@ -320,7 +324,7 @@ def _measure(task: _ReportedFrame) -> FrameFacts | FrameFailure:
             thinned = task.scans.thinned(task.plan)
         if thinned is not None:
             changes = Changes.between(sequence.grid(grid, number), thinned)
-        return FrameFacts.of(number, arrays, grid, spec, classes, changes, residuals)
+        return FrameFacts.of(number, arrays, grid, classes, changes, residuals)
     except (CarlascError, OSError) as error:
         return FrameFailure(sequence.location, number, str(error))
 

@@ -19,7 +19,10 @@ from carlasc.storage import layout
 from carlasc.storage.folder import FolderSequence, FolderWriter
 from carlasc.storage.protocol import Sequence, Source
 
-RANGE, GROUND, OVERLAP, OCCUPIED = "range", "ground", "poses-on-scans", "occupied"
+RANGE = "range"
+GROUND = "ground"
+OVERLAP = "poses-on-scans"
+OCCUPIED = "occupied"
 CHECKS = {
     RANGE: "points near the sensor",
     GROUND: "level ground below the sensor",
@@ -33,8 +36,8 @@ ACCEPTED: Final = "accepted"
 _FRAMES = "move each scan to the frame of its sensor, and write the poses of the sensor"
 _UPRIGHT = "convert again with `--level`, or with the right axes or mount"
 
-# no LiDAR sees farther; a greater share of such points is wrong
-_FAR_M, _FEW = 500.0, 0.001  # fact: far-points
+_FAR_M = 500.0  # no LiDAR sees farther
+_FEW = 0.001  # a greater share of such points is wrong; fact: far-points
 _TILT = 0.16  # slope of the ground against the sensor, above which grids are tilted
 _STEEPEST = 0.8  # greatest slope that is looked for
 _ABOVE_M = -0.05  # ground that is higher than this below the sensor is above it
@@ -76,10 +79,8 @@ class ScanFacts:
         for grid, occupied in self.occupied.items():
             empty = occupied.count(False)
             if empty > _EMPTY * len(occupied):
-                where, found = (
-                    f"{sequence.location}/{grid}",
-                    f"none in {empty} of {len(occupied)} frames",
-                )
+                where = f"{sequence.location}/{grid}"
+                found = f"none in {empty} of {len(occupied)} frames"
                 expected = CHECKS[OCCUPIED]
                 advice = "check the bounds of the grid"
                 yield Finding("warning", OCCUPIED, where, expected, found, advice)
@@ -105,7 +106,8 @@ class ScanFacts:
 
     def _ground(self, where: str) -> Iterator[Finding]:
         planes = np.array([plane for plane in self._planes if plane is not None]).reshape(-1, 3)
-        expected, scans = CHECKS[GROUND], len(self._planes)
+        expected = CHECKS[GROUND]
+        scans = len(self._planes)
         if len(planes) < _SEEN * scans:
             yield untested(GROUND, where, f"{scans - len(planes)} of {scans} scans show no ground")
             return

@@ -35,7 +35,8 @@ class _Records(SequenceWriter):
     """Reads the records of a sequence, and writes nothing."""
 
     def __init__(self, sequence: Sequence) -> None:
-        self.sequence, self.location = sequence, sequence.location
+        self.sequence = sequence
+        self.location = sequence.location
 
     def has(self, field: str, frame: int) -> bool:
         return frame in self.sequence.frames(field)

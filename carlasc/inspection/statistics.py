@@ -312,7 +312,8 @@ def _count(
     task: _Task, classes: ClassTable, allow_unknown: bool
 ) -> tuple[Histogram, list[tuple[str, str]]]:
     """Count the classes of some frames; runs in a worker."""
-    histogram, failures = Histogram.empty(classes), []
+    histogram = Histogram.empty(classes)
+    failures = []
     for frame in task[2]:
         try:
             histogram += _count_frame(*task[:2], frame, classes, allow_unknown)
@@ -332,20 +333,25 @@ def _count_frame(
     where = f"{sequence.location}: {field} of frame {frame}"
     stored = _table_of(sequence, field)
     labels = sequence.read(field, frame)
-    labels, unlisted = labels.reshape(-1), Counter[int]()
+    labels = labels.reshape(-1)
+    unlisted = Counter[int]()
     listed = np.ones(labels.shape, np.bool_)
     if allow_unknown and (others := stored.unknown(labels)):
-        listed, unlisted = ~np.isin(labels, list(others)), Counter(others)
+        listed = ~np.isin(labels, list(others))
+        unlisted = Counter(others)
         labels = np.where(listed, labels, 0)
     stored.check(labels, where)
-    labels, unknown = to_table(labels, stored, classes, where), 0
-    histogram, grid = Histogram.empty(classes), field.removesuffix("labels")
+    labels = to_table(labels, stored, classes, where)
+    unknown = 0
+    histogram = Histogram.empty(classes)
+    grid = field.removesuffix("labels")
     if not grid:
         points = np.bincount(labels[listed], minlength=classes.num_channels)
         return replace(histogram, points=points, scans=1, unlisted=unlisted)
     if f"{grid}counts" in sequence.fields():
         known = sequence.read(f"{grid}counts", frame).reshape(-1) > 0
-        listed, unknown = listed & known, int(np.count_nonzero(~known))
+        listed = listed & known
+        unknown = int(np.count_nonzero(~known))
     who = list[int]()
     for part in layout.ACTOR_FIELDS:
         has = f"{grid}{part}" in sequence.fields() and frame in sequence.frames(f"{grid}{part}")

@@ -94,10 +94,8 @@ def check_reports(sequence: Sequence, frames: Iterable[int]) -> Iterator[Finding
         for expected, found in _differences(sequence, grid, report, frames, digest):
             yield Finding("warning", "report", where, expected, found, _ADVICE)
         if missing := set(sequence.frames(f"{grid}/labels").tolist()) - set(report.frames):
-            expected, found = (
-                "a report of all frames",
-                f"{len(missing)} frames that it does not cover",
-            )
+            expected = "a report of all frames"
+            found = f"{len(missing)} frames that it does not cover"
             yield Finding("note", "report", where, expected, found, _ADVICE)
         yield from check_actors(sequence, grid, report.actors or ())
 
@@ -388,7 +386,8 @@ def _diagnose_poses(sequence: Sequence) -> tuple[PoseDiagnosis, LongOverlap] | t
 def _judge_grid(
     sequence: Sequence, grid: str, spec: GridSpec, diagnosis: GridDiagnosis
 ) -> Iterator[Finding]:
-    own, corrected = diagnosis.share, diagnosis.corrected_share
+    own = diagnosis.share
+    corrected = diagnosis.corrected_share
     share = f"{own:.1%} of the points in known voxels, over {diagnosis.frames} frames"
     # The labels are wrong, not the geometry, if occupied voxels agree much better than classes.
     other_classes = diagnosis.occupied_share > max(_DOUBTFUL_SHARE, own + 0.2)
@@ -432,16 +431,19 @@ def _judge_poses(
     sequence: Sequence, diagnosis: PoseDiagnosis, overlap: LongOverlap
 ) -> Iterator[Finding]:
     where = f"{sequence.location}/{layout.POSES}"
-    quality, correction = diagnosis.quality, diagnosis.correction
+    quality = diagnosis.quality
+    correction = diagnosis.correction
     mounting = None if quality is None else quality.mounting
     if "kiss-icp" in str(sequence.metadata.extra.get("poses")):
         mounting = None  # poses found from the scans are those of the sensor
     described = None if mounting is None else describe_mounting(mounting)
-    check, expected = OVERLAP, CHECKS[OVERLAP]
+    check = OVERLAP
+    expected = CHECKS[OVERLAP]
     share = f"{diagnosis.share:.1%} of a scan's structure overlaps that of an earlier scan"
     severity: Severity = "warning"
     if correction is not None:
-        severity, advice = "error", correction.advice
+        severity = "error"
+        advice = correction.advice
         found = (
             f"{diagnosis.share_there:.1%} of a scan's structure overlaps that of an earlier scan; "
             f"the likely cause is {correction.name}: after correction, "

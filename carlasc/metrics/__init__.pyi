@@ -31,7 +31,6 @@ from .regions import distance_band as distance_band
 from .regions import distance_bands as distance_bands
 from .regions import field_of_view as field_of_view
 from .regions import height_bands as height_bands
-from .regions import known as known
 from .regions import motion as motion
 from .regions import visibility as visibility
 from .results import Comparison as Comparison
@@ -50,7 +49,6 @@ from .temporal import Consistency as Consistency
 from .temporal import TrackingQuality as TrackingQuality
 from .temporal import TrackingScore as TrackingScore
 from .temporal import moved_grid as moved_grid
-from .temporal import shape_consistency as shape_consistency
 from .uncertainty import Reliability as Reliability
 from .uncertainty import Uncertainty as Uncertainty
 from .uncertainty import UncertaintyScore as UncertaintyScore

@@ -113,7 +113,8 @@ class ActorScores:
             FormatError: a file does not fit its grid.
         """
         prediction, truth, counted = prepared
-        known, moving = dict[str, AnyArray](), dict[str, AnyFloatArray]()
+        known = dict[str, AnyArray]()
+        moving = dict[str, AnyFloatArray]()
         for name, side in (("prediction", pair.prediction), ("truth", pair.truth)):
             if isinstance(side, SequenceGrid):
                 known[name] = side.sequence.read(f"{side.grid}/instance", frame)

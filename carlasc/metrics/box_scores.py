@@ -147,7 +147,8 @@ def evaluate_boxes(
     for index, frame in enumerate(frames):
         own = np.flatnonzero(place == index)
         world = boxes[frame].transform(poses[index])
-        values, axes = table.values[own], world.sensor_T_box[:, :2, 0]
+        values = table.values[own]
+        axes = world.sensor_T_box[:, :2, 0]
         local = transform_points(invert(poses[index]), values[:, :3])
         inside = [
             (np.hypot(at[:, 0], at[:, 1]) >= near_m)
@@ -183,9 +184,11 @@ def evaluate_boxes(
 def _score(frames: list[_Frame], objects: str, threshold: float) -> BoxScore:
     """Return the scores at one IoU, with the pairs of CLEAR MOT as TrackEval finds them."""
     assign = import_extra("scipy.optimize", "kitti").linear_sum_assignment
-    before, last = dict[int, int](), dict[int, int]()
+    before = dict[int, int]()
+    last = dict[int, int]()
     hits = total = false = switches = 0
-    heading, velocity = list[float](), list[float]()
+    heading = list[float]()
+    velocity = list[float]()
     ranked = list[tuple[float, bool]]()  # confidence, and whether it is right
     for frame in frames:
         wanted = frame.scored & (frame.moving | (objects == "all"))
@@ -201,7 +204,8 @@ def _score(frames: list[_Frame], objects: str, threshold: float) -> BoxScore:
             for t, d in zip(rows[counted], columns[counted], strict=True)
         )
         last |= before
-        hits, total = hits + int(counted.sum()), total + int(wanted.sum())
+        hits = hits + int(counted.sum())
+        total = total + int(wanted.sum())
         false += int(np.delete(~frame.outside, columns).sum())
         heading += frame.heading[rows[counted], columns[counted]].tolist()
         velocity += frame.velocity[rows[counted], columns[counted]].tolist()
@@ -225,7 +229,8 @@ def _ranked(frame: _Frame, wanted: BoolArray, good: BoolArray) -> list[tuple[flo
     """Return the confidence of the counted found boxes of a frame, and whether each is right: the
     surest one takes the free true box with the highest IoU, and one that is scored before others.
     """
-    free, ranked = np.ones(len(wanted), np.bool_), list[tuple[float, bool]]()
+    free = np.ones(len(wanted), np.bool_)
+    ranked = list[tuple[float, bool]]()
     for row in np.argsort(-frame.confidence, kind="stable").tolist():
         gain = np.where(good[:, row] & free, frame.iou[:, row] + wanted, 0)
         if gain.any():
@@ -247,7 +252,8 @@ def _average_precision(ranked: list[tuple[float, bool]], total: int) -> float:
     sure, right = np.array(ranked).reshape(-1, 2).T
     right = right[np.argsort(-sure, kind="stable")]
     ends = np.append(np.diff(-np.sort(-sure)) != 0, True)[: len(sure)]
-    hits, many = np.cumsum(right)[ends], (np.arange(len(sure)) + 1)[ends]
+    hits = np.cumsum(right)[ends]
+    many = (np.arange(len(sure)) + 1)[ends]
     best = [(hits / many)[hits >= level * total - 1e-9].max(initial=0) for level in _LEVELS]
     return float(np.mean(best))
 
@@ -258,7 +264,8 @@ def _overlaps(true: FloatArray, found: FloatArray) -> FloatArray:
     apart = np.hypot(*(true[:, None, :2] - found[:, :2]).T).T
     near = apart < (true[:, 2:4].sum(axis=1)[:, None] + found[:, 2:4].sum(axis=1)) / 2
     for row, column in np.argwhere(near).tolist():
-        a, b = true[row], found[column]
+        a = true[row]
+        b = found[column]
         shared = _shared_area(a, b)
         iou[row, column] = shared / (a[2] * a[3] + b[2] * b[3] - shared)
     return iou

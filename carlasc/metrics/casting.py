@@ -76,7 +76,8 @@ def cast_rays(
             "grids", expected=f"shape (G, {', '.join(map(str, spec.size))})", found=grids.shape
         )
     starts = np.asarray(origins, np.float64).reshape(-1, 3)
-    lower, voxel = np.array(spec.lower), spec.voxel_size
+    lower = np.array(spec.lower)
+    voxel = spec.voxel_size
     steps = np.asarray(directions, np.float64).reshape(-1, 3)
     solid = np.zeros(grids.shape[1:], np.uint8)
     for bit, grid in enumerate(grids):
@@ -132,7 +133,8 @@ def follow_rays(
     ends = np.asarray(points, np.float64)
     lower = np.array(spec.lower)
     voxel = spec.voxel_size
-    first, passed = np.full(len(ends), np.inf), np.zeros(len(ends), np.uint8)
+    first = np.full(len(ends), np.inf)
+    passed = np.zeros(len(ends), np.uint8)
     start = (np.asarray(origin, np.float64) - lower) / voxel
     size = np.array(spec.size)
     lengths = np.linalg.norm(ends - origin, axis=1)
@@ -151,7 +153,8 @@ def _follow(solid, size, start, ends, lengths, first, passed):  # type: ignore[n
     step = np.empty(3)
     cell = np.empty(3, np.int64)
     last = np.empty(3, np.int64)
-    crossing, between = np.empty(3), np.empty(3)
+    crossing = np.empty(3)
+    between = np.empty(3)
     for r in range(len(ends)):
         inside = True
         for axis in range(3):
@@ -200,13 +203,20 @@ def _cast(solid, size, starts, steps, voxels, depth):  # type: ignore[no-untyped
     """
     num_grids = len(voxels)
     everything = (1 << num_grids) - 1
-    nx, ny, nz = size[0], size[1], size[2]
-    row, plane = nz, ny * nz
+    nx = size[0]
+    ny = size[1]
+    nz = size[2]
+    row = nz
+    plane = ny * nz
     for o in range(len(starts)):
         for r in range(len(steps)):
             ray = o * len(steps) + r
-            x, y, z = starts[o, 0], starts[o, 1], starts[o, 2]
-            dx, dy, dz = steps[r, 0], steps[r, 1], steps[r, 2]
+            x = starts[o, 0]
+            y = starts[o, 1]
+            z = starts[o, 2]
+            dx = steps[r, 0]
+            dy = steps[r, 1]
+            dz = steps[r, 2]
             entry = 0.0
             if not (0 <= x < nx and 0 <= y < ny and 0 <= z < nz):
                 entry = _entry((x, y, z), (dx, dy, dz), (nx, ny, nz))
@@ -222,15 +232,16 @@ def _cast(solid, size, starts, steps, voxels, depth):  # type: ignore[no-untyped
             tx = (i + (dx > 0) - x) / dx if dx != 0 else np.inf
             ty = (j + (dy > 0) - y) / dy if dy != 0 else np.inf
             tz = (k + (dz > 0) - z) / dz if dz != 0 else np.inf
-            sx, sy, sz = np.abs(1 / dx), np.abs(1 / dy), np.abs(1 / dz)
+            sx = np.abs(1 / dx)
+            sy = np.abs(1 / dy)
+            sz = np.abs(1 / dz)
             # number of faces before the ray leaves the grid: counting down takes one comparison per
             # step
-            left_x, left_y, left_z = (
-                (nx - 1 - i if dx > 0 else i),
-                (ny - 1 - j if dy > 0 else j),
-                (nz - 1 - k if dz > 0 else k),
-            )
-            ix, iy = ix * plane, iy * row
+            left_x = nx - 1 - i if dx > 0 else i
+            left_y = ny - 1 - j if dy > 0 else j
+            left_z = nz - 1 - k if dz > 0 else k
+            ix = ix * plane
+            iy = iy * row
             voxel = i * plane + j * row + k
             open_grids = everything
             while True:
@@ -239,23 +250,31 @@ def _cast(solid, size, starts, steps, voxels, depth):  # type: ignore[no-untyped
                 if hit:
                     for g in range(num_grids):
                         if hit >> g & 1:
-                            voxels[g, ray], depth[g, ray] = voxel, t
+                            voxels[g, ray] = voxel
+                            depth[g, ray] = t
                     open_grids ^= hit
                     if not open_grids:
                         break
                 if tx <= ty and tx <= tz:
                     inside = left_x > 0
-                    left_x, tx, step = left_x - 1, tx + sx, ix
+                    left_x = left_x - 1
+                    tx = tx + sx
+                    step = ix
                 elif ty <= tz:
                     inside = left_y > 0
-                    left_y, ty, step = left_y - 1, ty + sy, iy
+                    left_y = left_y - 1
+                    ty = ty + sy
+                    step = iy
                 else:
                     inside = left_z > 0
-                    left_z, tz, step = left_z - 1, tz + sz, iz
+                    left_z = left_z - 1
+                    tz = tz + sz
+                    step = iz
                 if not inside:
                     for g in range(num_grids):
                         if open_grids >> g & 1:
-                            voxels[g, ray], depth[g, ray] = voxel, t
+                            voxels[g, ray] = voxel
+                            depth[g, ray] = t
                     break
                 voxel += step
 
@@ -263,7 +282,8 @@ def _cast(solid, size, starts, steps, voxels, depth):  # type: ignore[no-untyped
 @jit
 def _entry(start, step, size):  # type: ignore[no-untyped-def]
     """Return the distance at which a ray from outside enters the grid; -1 if it misses the grid."""
-    near, far = 0.0, np.inf
+    near = 0.0
+    far = np.inf
     for axis in range(3):
         if step[axis] == 0:
             if not 0 <= start[axis] < size[axis]:
@@ -271,5 +291,6 @@ def _entry(start, step, size):  # type: ignore[no-untyped-def]
             continue
         one = -start[axis] / step[axis]
         other = (size[axis] - start[axis]) / step[axis]
-        near, far = max(near, min(one, other)), min(far, max(one, other))
+        near = max(near, min(one, other))
+        far = min(far, max(one, other))
     return near if near < far else -1.0

@@ -57,7 +57,8 @@ class ConfusionMatrix(Summed):
         counts: (K, K) int64, ground truth in rows, prediction in columns.
     """
 
-    _SETTINGS, _SUMS = ("num_classes", "free"), ("counts",)
+    _SETTINGS = ("num_classes", "free")
+    _SUMS = ("counts",)
 
     def __init__(
         self, num_classes: int, *, free: int = 0, counts: AnyIntArray | None = None
@@ -126,9 +127,6 @@ class ConfusionMatrix(Summed):
         of occupied space.
         """
         return {"miou": self.miou, "accuracy": self.accuracy, **vars(self.completeness())}
-
-    def __iadd__(self, other: Self) -> Self:
-        return self.merge(other)
 
     def __add__(self, other: ConfusionMatrix) -> ConfusionMatrix:
         return ConfusionMatrix(self.num_classes, free=self.free, counts=self.counts).merge(other)
@@ -309,7 +307,8 @@ def score_truth(
             "grid", expected=f"the geometry of the reference, {expected}", found=found
         )
     selected = np.ones(grid.spec.size, np.bool_) if mask is None else mask
-    known, known_reference = grid.known & selected, reference.known & selected
+    known = grid.known & selected
+    known_reference = reference.known & selected
     both = known & known_reference
     matrix = ConfusionMatrix(num_classes).update(grid.labels, reference.labels, both)
     return TruthScore(matrix, int(known.sum()), int(known_reference.sum()), int(both.sum()))
@@ -381,10 +380,12 @@ def count_tensors(
     def flat(array: Labels) -> torch.Tensor:
         return torch.as_tensor(array, device=device).reshape(-1)
 
-    predicted, true = flat(prediction), flat(truth)
+    predicted = flat(prediction)
+    true = flat(truth)
     if mask is not None:
         counted = flat(mask).bool()
-        predicted, true = predicted[counted], true[counted]
+        predicted = predicted[counted]
+        true = true[counted]
     for ids in (predicted, true):
         whole = not (ids.is_floating_point() or ids.is_complex())
         if not whole or (ids.numel() and (ids.min() < 0 or ids.max() >= num_classes)):

@@ -35,7 +35,9 @@ from carlasc.core.tables import (
 from carlasc.errors import FormatError, check_choice
 from carlasc.metrics.confusion import ConfusionMatrix
 
-_LEFT_OUT, _UNKNOWN = 254, 255  # values in the look-up tables; the scored ids are smaller
+# values in the look-up tables; the scored ids are smaller
+_LEFT_OUT = 254
+_UNKNOWN = 255
 
 Absent = Literal["zero", "skip", "skip-truth", "nan"]
 

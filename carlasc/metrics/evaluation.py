@@ -46,7 +46,9 @@ _Known = Callable[[SeenBy], BoolArray | None]
 # Labels of prediction and ground truth, and `known` of the ground truth, which is read once for all
 # conventions.
 LabelPair = tuple[LabelArray, LabelArray, _Known]
-_DISTANCES_M, _HEIGHTS = (0, 10, 20, 30), 4  # edges and number of the bands of `by`
+# edges and number of the bands of `by`
+_DISTANCES_M = (0, 10, 20, 30)
+_HEIGHTS = 4
 _TOGETHER = 8  # frames that a worker scores in one task
 _TRIED = 4  # sequences whose first and last frames are read to find a table by its ids
 
@@ -81,7 +83,8 @@ class Scorer:
 
     def reset(self) -> None:
         """Set all sums to zero."""
-        classes, free = self.convention.num_classes, self.convention.free
+        classes = self.convention.num_classes
+        free = self.convention.free
         self.matrices = {path: self._matrix() for path in self.tables}
         self.failures: list[tuple[str, str]] = []
         self.unknown: dict[str, Counter[int]] = {"prediction": Counter(), "truth": Counter()}
@@ -114,7 +117,8 @@ class Scorer:
         """Score a frame, or record the error that prevents it."""
         if self.impossible is not None:
             return
-        path, frame_name = pair.truth.path, pair.truth.name_of(frame)
+        path = pair.truth.path
+        frame_name = pair.truth.name_of(frame)
         try:
             if isinstance(content, CarlascError):
                 raise content
@@ -185,7 +189,8 @@ class Scorer:
         prediction = given or pair.prediction.classes or self.convention.usual_prediction
         how = "option" if given is not None else pair.prediction.named
         if how == "assumed" and self.found is not None:
-            prediction, how = self.found, "ids"
+            prediction = self.found
+            how = "ids"
         self.convention.check(truth, pair.truth.location)
         self.convention.check(prediction, pair.prediction.location)
         self.uses[0].add(TableUse(prediction.name, how))
@@ -198,7 +203,8 @@ class Scorer:
                 found="data without one of them",
                 advice="make the grids with --keep-seen, or leave out the scores by `seen`",
             )
-        true_spec, predicted_spec = pair.truth.spec, pair.prediction.spec
+        true_spec = pair.truth.spec
+        predicted_spec = pair.prediction.spec
         if true_spec and predicted_spec and true_spec != predicted_spec:
             raise FormatError(
                 pair.prediction.location,
@@ -255,7 +261,8 @@ class Scorer:
             )
             matrix = self._matrix().update(pred, true, counted)
             if (self.scoring.by or self.scoring.rays or self.scoring.actors) and spec is not None:
-                pred, true = pred.reshape(spec.size), true.reshape(spec.size)
+                pred = pred.reshape(spec.size)
+                true = true.reshape(spec.size)
                 counted = counted.reshape(spec.size)
                 if self.actors is not None:
                     self.actors.update(pair, frame, (pred, true, counted))
@@ -346,7 +353,8 @@ def _find_by_ids(pairs: list[Pair], convention: Convention) -> ClassTable | None
 
     The first and the last frame of some sequences are read.
     """
-    usual, ids = convention.usual_prediction, (set[int](), set[int]())
+    usual = convention.usual_prediction
+    ids = (set[int](), set[int]())
     for pair in pairs[:_TRIED]:
         if pair.prediction.named != "assumed" or pair.truth.classes == usual:
             continue
@@ -357,7 +365,8 @@ def _find_by_ids(pairs: list[Pair], convention: Convention) -> ClassTable | None
                     found.update(np.unique(side.labels(frame)).tolist())
             except CarlascError:
                 continue  # scoring names it
-    predicted, true = ids[0] - {IGNORED_ID}, ids[1]
+    predicted = ids[0] - {IGNORED_ID}
+    true = ids[1]
     beyond = true and max(true) > max(usual.names)
     return usual if predicted and predicted <= usual.names.keys() and beyond else None
 
@@ -564,7 +573,8 @@ def _read(pair: Pair, frame: int, predicted: set[int]) -> LabelPair:
             expected=f"a prediction for frame {pair.truth.name_of(frame)}",
             found="none",
         )
-    prediction, truth = pair.prediction.labels(frame), pair.truth.labels(frame)
+    prediction = pair.prediction.labels(frame)
+    truth = pair.truth.labels(frame)
     if prediction.size != truth.size:
         where = f"{pair.prediction.location}: frame {pair.truth.name_of(frame)}"
         raise FormatError(

@@ -53,12 +53,15 @@ class FutureGrid(GridFrames):
             raise MissingDataError(
                 grid.location, expected="a sequence with poses and times", found="files of grids"
             )
-        self.grid, self.around = grid, around
-        self.path, self.location = grid.path, grid.location
+        self.grid = grid
+        self.around = around
+        self.path = grid.path
+        self.location = grid.location
         self.spec = grid.spec
         self.classes = grid.classes
         self.named = grid.named
-        numbers, sequence = grid.frames(), grid.sequence
+        numbers = grid.frames()
+        sequence = grid.sequence
         times = sequence.times_of(numbers)
         wanted = times + horizon_s
         after = np.searchsorted(times, wanted).clip(max=len(times) - 1)
@@ -96,7 +99,8 @@ class FutureGrid(GridFrames):
         return self._later(frame).known
 
     def _later(self, frame: int) -> Grid:
-        sequence, later = self.grid.sequence, self.later[frame]
+        sequence = self.grid.sequence
+        later = self.later[frame]
         grid = sequence.grid(self.grid.grid, later)
         if self.around == "future":
             return grid
@@ -171,7 +175,8 @@ def _horizons(source: Place, grid: str | None) -> dict[float, str]:
         MissingDataError: no forecast grid exists.
         ArgumentError: several forecast grids have the same horizon.
     """
-    opened, tokens = as_source(source), dict[float, str]()
+    opened = as_source(source)
+    tokens = dict[float, str]()
     names = sorted({name for sequence in opened.sequences().values() for name in sequence.grids})
     for match in filter(None, map(_NAMED.fullmatch, names)):
         if (

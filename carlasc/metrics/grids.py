@@ -17,9 +17,12 @@ class SequenceGrid(GridFrames):
     """A grid of a sequence of a Source."""
 
     def __init__(self, sequence: Sequence, grid: str) -> None:
-        self.sequence, self.grid = sequence, grid
-        self.path, self.location = sequence.path, f"{sequence.location}/{grid}"
-        self.spec, self.classes = sequence.grids[grid], sequence.classes_of(grid)
+        self.sequence = sequence
+        self.grid = grid
+        self.path = sequence.path
+        self.location = f"{sequence.location}/{grid}"
+        self.spec = sequence.grids[grid]
+        self.classes = sequence.classes_of(grid)
         self.named = sequence.table_use(grid).found
         has_poses = layout.POSES in sequence.documents()
         self.origin = (0.0, 0.0, 0.0) if has_poses else None
@@ -76,7 +79,8 @@ def compare_grids(prediction: Grid, truth: Grid) -> Uint8Array:
         ArgumentError: the grids differ in their geometry.
     """
     check_same_geometry(prediction.spec, truth.spec)
-    predicted, occupied = prediction.labels > 0, truth.labels > 0
+    predicted = prediction.labels > 0
+    occupied = truth.labels > 0
     right = occupied & (prediction.labels == truth.labels)
     # the first condition that holds decides
     conditions = [~truth.known, right, occupied & predicted, occupied, predicted]

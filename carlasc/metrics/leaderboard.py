@@ -28,7 +28,9 @@ _FIGURES = {
     "false_free": "False free",
 }
 _REQUIRED = ("name", "convention", "frames", "class_iou", *_FIGURES)
-_BAR, _HEIGHT = 7, 24  # pixels: width of a bar, and height of the chart
+# pixels: width of a bar, and height of the chart
+_BAR = 7
+_HEIGHT = 24
 
 
 @dataclass(frozen=True)
@@ -65,14 +67,6 @@ class ScoreTable:
             f"Scores by the convention {self.convention} (percent)", tuple(header), tuple(rows)
         )
 
-    def to_markdown(self) -> str:
-        """Return a Markdown table."""
-        return self.table().to_markdown()
-
-    def to_csv(self) -> str:
-        """Return a CSV table."""
-        return self.table().to_csv()
-
     def to_pandas(self) -> pandas.DataFrame:
         """Return one row per result, with the columns of `table`.
 
@@ -88,10 +82,6 @@ class ScoreTable:
             for row in rows
         )
         return data_frame(fractions, table.header[0])
-
-    def to_latex(self) -> str:
-        """Return a LaTeX `tabular`."""
-        return self.table().to_latex()
 
     def to_html(self) -> str:
         """Return a self-contained HTML page: the scores, and a bar chart of classes for each

@@ -134,7 +134,8 @@ def _match(
     Raises:
         MissingDataError: no prediction has ground truth.
     """
-    pairs, alone = list[Pair](), list[GridFrames]()
+    pairs = list[Pair]()
+    alone = list[GridFrames]()
     for prediction in predictions:
         found = _truths_of(prediction, truths)
         pairs += found
@@ -183,12 +184,15 @@ def open_grids(place: Place, grid: str | None, role: Role) -> Iterator[GridFrame
     Raises:
         MissingDataError: no grid exists.
     """
-    source, names, empty = place, list[str](), list[str]()
+    source = place
+    names = list[str]()
+    empty = list[str]()
     if not isinstance(source, Source):
         folder = Path(source)
         # folder of one grid; the folder above is the sequence
         if (folder / layout.PARAMS).is_file():
-            source, grid = folder.absolute().parent, folder.absolute().name
+            source = folder.absolute().parent
+            grid = folder.absolute().name
         elif folder.is_dir() and (plain := label_frames(folder)) is not None:
             # a folder in the tree of a benchmark has its rules
             yield from list(_foreign(find_voxels(folder), grid, role)) or (plain,)

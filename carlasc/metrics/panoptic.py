@@ -98,10 +98,8 @@ class PanopticQuality(Summed):
             positive if its class occurs in the ground truth.
     """
 
-    _SETTINGS, _SUMS = (
-        ("num_classes", "things", "free", "variant"),
-        ("counts", "iou_sum", "elements"),
-    )
+    _SETTINGS = ("num_classes", "things", "free", "variant")
+    _SUMS = ("counts", "iou_sum", "elements")
 
     def __init__(
         self,
@@ -120,8 +118,10 @@ class PanopticQuality(Summed):
                 expected=f"class ids below {num_classes} other than free",
                 found=sorted(things),
             )
-        self.num_classes, self.things = num_classes, frozenset(things)
-        self.free, self.variant = free, variant
+        self.num_classes = num_classes
+        self.things = frozenset(things)
+        self.free = free
+        self.variant = variant
         self.reset()
 
     def reset(self) -> None:
@@ -259,7 +259,8 @@ def _match(  # type: ignore[no-untyped-def]
     everywhere = len(may_overlap) == 1
     all_things = len(is_thing) == 1 and is_thing[0]
     for n in range(len(pred_class)):
-        has_pred, has_true = pred_class[n] != free, true_class[n] != free
+        has_pred = pred_class[n] != free
+        has_true = true_class[n] != free
         if not has_pred and not has_true:
             continue  # most elements are free in both
         for side in range(2):
@@ -290,7 +291,8 @@ def _match(  # type: ignore[no-untyped-def]
                     pairs[open_pairs[slot]] = (
                         pairs.get(open_pairs[slot], np.int64(0)) + open_counts[slot]
                     )
-                open_pairs[slot], open_counts[slot] = pair, np.int64(0)
+                open_pairs[slot] = pair
+                open_counts[slot] = np.int64(0)
             open_counts[slot] += np.int64(1)
     for slot in np.arange(_SLOTS):
         if open_pairs[slot] >= 0:
@@ -299,10 +301,8 @@ def _match(  # type: ignore[no-untyped-def]
     row = 0
     for pair, count in pairs.items():
         if pair >= 0:
-            overlaps[row, 0], overlaps[row, 1], overlaps[row, 2] = (
-                pair >> 32,
-                pair & 0xFFFFFFFF,
-                count,
-            )
+            overlaps[row, 0] = pair >> 32
+            overlaps[row, 1] = pair & 0xFFFFFFFF
+            overlaps[row, 2] = count
             row += 1
     return np.array(keys[0]), np.array(sizes[0]), np.array(keys[1]), np.array(sizes[1]), overlaps

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from carlasc.core.arrays import AnyArray, FloatArray, IntArray
 from carlasc.core.geometry import Transform, invert
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError, FormatError
+from carlasc.errors import FormatError
 from carlasc.metrics.casting import cast_rays, rayiou_directions
 from carlasc.metrics.confusion import check_free, check_ids, mean_of, ratio, to_numpy
 from carlasc.metrics.panoptic import PanopticQuality, PanopticScore, match_segments
@@ -96,21 +96,16 @@ class RayIoU(Summed):
     Attributes:
         num_classes: K; ids are 0..K-1.
         free: id of free space.
-        skip_unknown: leave out rays that cross an unknown voxel before the first surface of the
-            ground truth. In the original metric, unknown voxels count as free.
     """
 
-    _SETTINGS, _SUMS = (
-        ("num_classes", "free", "skip_unknown"),
-        ("true", "predicted", "hits"),
-    )
+    _SETTINGS = ("num_classes", "free")
+    _SUMS = ("true", "predicted", "hits")
 
     def __init__(
         self,
         num_classes: int,
         *,
         free: int = 0,
-        skip_unknown: bool = False,
         directions: ArrayLike | None = None,
     ) -> None:
         """Create an empty metric.
@@ -120,10 +115,7 @@ class RayIoU(Summed):
         check_free(free, num_classes)
         self.num_classes = num_classes
         self.free = free
-        self.skip_unknown = skip_unknown
-        self.directions = (
-            rayiou_directions() if directions is None else np.asarray(directions, np.float64)
-        )
+        self.directions = directions
         self.reset()
 
     def reset(self) -> None:
@@ -133,12 +125,7 @@ class RayIoU(Summed):
         self.hits = np.zeros((len(THRESHOLDS_M), self.num_classes), np.int64)
 
     def update(
-        self,
-        prediction: ArrayLike,
-        truth: ArrayLike,
-        spec: GridSpec,
-        origins: ArrayLike,
-        known: ArrayLike | None = None,
+        self, prediction: ArrayLike, truth: ArrayLike, spec: GridSpec, origins: ArrayLike
     ) -> Self:
         """Add a frame.
 
@@ -147,28 +134,19 @@ class RayIoU(Summed):
             truth: (X, Y, Z) class ids, NumPy or a torch tensor.
             spec: geometry of both, Cartesian.
             origins: (O, 3) ray origins, metres, in the frame of the grid (see `ray_origins`).
-            known: (X, Y, Z) bool, known voxels of the ground truth; only used with `skip_unknown`.
 
         Returns:
             The metric itself.
 
         Raises:
             FormatError: shapes differ, or an id is not below `num_classes`.
-            ArgumentError: the grid is cylindrical, or `skip_unknown` is set and `known` is missing.
+            ArgumentError: the grid is cylindrical.
         """
         pred = self._check(prediction, "prediction", spec)
         true = self._check(truth, "truth", spec)
-        further = []
-        if self.skip_unknown:
-            if known is None:
-                raise ArgumentError(
-                    "known", expected="the known voxels of the ground truth", found="None"
-                )
-            seen = np.asarray(known, np.bool_)
-            # unknown voxels stop a ray here
-            further.append(np.where(seen, true, self.num_classes).astype(np.uint16))
-        near, far, off = _first_surfaces([pred, true, *further], spec, origins, self)
-        flat_pred, flat_true = pred.reshape(-1)[near], true.reshape(-1)[far]
+        near, far, off = _first_surfaces(pred, true, spec, origins, self)
+        flat_pred = pred.reshape(-1)[near]
+        flat_true = true.reshape(-1)[far]
         self.true += np.bincount(flat_true, minlength=self.num_classes)
         self.predicted += np.bincount(flat_pred, minlength=self.num_classes)
         same = flat_pred == flat_true
@@ -212,10 +190,10 @@ class RayPQ:
 
         `directions` are (R, 3) unit vectors of the rays; None takes `rayiou_directions`.
         """
-        self.num_classes, self.things, self.free = num_classes, things, free
-        self.directions = (
-            rayiou_directions() if directions is None else np.asarray(directions, np.float64)
-        )
+        self.num_classes = num_classes
+        self.things = things
+        self.free = free
+        self.directions = directions
         self.reset()
 
     def reset(self) -> None:
@@ -243,7 +221,7 @@ class RayPQ:
         (pred, pred_ids), (true, true_ids) = (
             [to_numpy(a) for a in side] for side in (prediction, truth)
         )
-        near, far, off = _first_surfaces([pred, true], spec, origins, self)
+        near, far, off = _first_surfaces(pred, true, spec, origins, self)
         classes = pred.reshape(-1)[near], true.reshape(-1)[far]
         is_thing = np.isin(classes[1], sorted(self.things))
         ids = pred_ids.reshape(-1)[near], np.where(is_thing, true_ids.reshape(-1)[far], 0)
@@ -272,21 +250,29 @@ class RayPQ:
 
 
 def _first_surfaces(
-    grids: list[AnyArray], spec: GridSpec, origins: ArrayLike, metric: RayIoU | RayPQ
+    prediction: AnyArray,
+    truth: AnyArray,
+    spec: GridSpec,
+    origins: ArrayLike,
+    metric: RayIoU | RayPQ,
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Return the first voxel of the prediction and of the ground truth on each ray with a surface
     in the ground truth, and the difference of their distances, metres.
 
     Args:
-        grids: class ids of the prediction and of the ground truth; a third grid drops rays whose
-            first voxel is another one in it than in the ground truth.
+        prediction: (X, Y, Z) class ids.
+        truth: (X, Y, Z) class ids.
         spec: geometry of the grids.
         origins: (O, 3) metres.
         metric: has the directions of the rays and the id of free space.
     """
+    directions = rayiou_directions() if metric.directions is None else metric.directions
     voxels, depths = cast_rays(
-        np.stack(grids), spec, np.asarray(origins), metric.directions, free=metric.free
+        np.stack([prediction, truth]),
+        spec,
+        np.asarray(origins),
+        np.asarray(directions),
+        free=metric.free,
     )
-    valid = (voxels[1] >= 0) & (grids[1].reshape(-1)[voxels[1]] != metric.free)
-    valid &= voxels[-1] == voxels[1] if len(grids) > 2 else True
+    valid = (voxels[1] >= 0) & (truth.reshape(-1)[voxels[1]] != metric.free)
     return voxels[0][valid], voxels[1][valid], np.abs(depths[0] - depths[1])[valid]

@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from carlasc.core.arrays import AnyArray, BoolArray
+from carlasc.core.arrays import BoolArray
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.errors import ArgumentError
@@ -20,13 +20,6 @@ from carlasc.metrics.casting import cast_rays
 from carlasc.metrics.confusion import ConfusionMatrix
 
 Masks = Mapping[str, BoolArray]
-
-
-def known(counts: AnyArray) -> BoolArray:
-    """Return the voxels with votes (count > 0), bool with the shape of `counts`: the rule of the
-    data set.
-    """
-    return counts > 0
 
 
 def distance_band(spec: GridSpec, near_m: float = 0.0, far_m: float = math.inf) -> BoolArray:
@@ -176,7 +169,8 @@ class Breakdown:
     """Accumulates one confusion matrix per region."""
 
     def __init__(self, num_classes: int, *, free: int = 0) -> None:
-        self.num_classes, self.free = num_classes, free
+        self.num_classes = num_classes
+        self.free = free
         self.matrices: dict[str, ConfusionMatrix] = {}
 
     def update(
@@ -210,8 +204,7 @@ class Breakdown:
     def merge(self, other: Breakdown) -> Self:
         """Add the matrices of another breakdown. Regions of only one of them are kept."""
         for name, matrix in other.matrices.items():
-            own = self._matrix(name)
-            own += matrix
+            self._matrix(name).merge(matrix)
         return self
 
     def _matrix(self, name: str) -> ConfusionMatrix:

@@ -28,7 +28,9 @@ Score = Callable[[ConfusionMatrix], float]
 _LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _FEWEST_SEQUENCES = 5
 _LEVEL = 0.95  # of confidence
-_DRAWS, _SEED, _EXACT = 2000, 0, 12  # of swaps; fact: draws
+_DRAWS = 2000  # of swaps; fact: draws
+_SEED = 0
+_EXACT = 12  # of sequences, up to which all swaps are made
 _NEARLY_NORMAL = 1000.0  # degrees of freedom of Student's t
 
 
@@ -176,7 +178,8 @@ class Evaluation:
 
     def about_absent(self) -> str:
         """Return what the absent classes do to the mean, one sentence; "" without such classes."""
-        names, rule = self.absent_classes, self.convention.absent
+        names = self.absent_classes
+        rule = self.convention.absent
         if not names or not self.matrix.total:
             return ""
         effect = {"zero": "count 0 in the mean", "nan": "make the mean undefined"}
@@ -238,7 +241,8 @@ class Evaluation:
         """Return the table of panoptic quality and LSTQ, if actors were scored."""
         if self.actors is None:
             return ()
-        score, names = self.actors.panoptic, self.classes.names
+        score = self.actors.panoptic
+        names = self.classes.names
         present = [label for label in sorted(names) if not math.isnan(score.pq[label])]
         lstq = (self.actors.tracking.lstq, self.actors.tracking.association)
         row = _percent(*score.pq[present].tolist(), score.mean(), score.mean(which="things"), *lstq)
@@ -429,7 +433,8 @@ def estimate(
     number = sum(places.values()) or len(summed)
     values = np.array(summed)
     sizes = np.array(of or [1 / number] * len(summed))
-    ratio, degrees = values.sum() / (sizes.sum() or math.nan), len(values) - 1
+    ratio = values.sum() / (sizes.sum() or math.nan)
+    degrees = len(values) - 1
     if not degrees:
         return Interval(ratio, math.nan, math.nan)
     error = (values - ratio * sizes) / sizes.mean()

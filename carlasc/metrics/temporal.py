@@ -12,7 +12,6 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from carlasc.core.arrays import BoolArray
 from carlasc.core.classes import ids_in
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import Grid
@@ -55,7 +54,8 @@ class Consistency(Summed):
         matrix: confusion matrix with the earlier frame in rows and the later frame in columns.
     """
 
-    _SETTINGS, _SUMS = ("moving",), ("matrix",)
+    _SETTINGS = ("moving",)
+    _SUMS = ("matrix",)
 
     def __init__(self, num_classes: int, moving: Iterable[int], *, free: int = 0) -> None:
         """Create an empty metric.
@@ -117,26 +117,6 @@ class Consistency(Summed):
         self.matrix = ConfusionMatrix(self.matrix.num_classes, free=self.matrix.free)
 
 
-def shape_consistency(earlier: BoolArray, later: BoolArray) -> float:
-    """Return the IoU of the shapes of an actor in two frames, both in the reference frame of the
-    actor.
-
-    Args:
-        earlier: (X, Y, Z) bool, voxels of the actor in the earlier frame.
-        later: (X, Y, Z) bool, voxels of the actor in the later frame, with the same geometry.
-
-    Returns:
-        IoU from 0 to 1; NaN if the actor has no voxel in both.
-
-    Raises:
-        FormatError: shapes differ.
-    """
-    if earlier.shape != later.shape:
-        raise FormatError("later", expected=f"shape {earlier.shape}", found=later.shape)
-    union = int(np.count_nonzero(earlier | later))
-    return np.count_nonzero(earlier & later) / union if union else float("nan")
-
-
 _Sizes = Counter[tuple[str | int, ...]]
 
 
@@ -170,10 +150,8 @@ class TrackingQuality(Summed):
         fewest: a true actor is scored only in frames in which it has more elements than this.
     """
 
-    _SETTINGS, _SUMS = (
-        ("num_classes", "things", "ignored", "unaveraged", "fewest"),
-        ("confusion", "predicted", "true", "common"),
-    )
+    _SETTINGS = ("num_classes", "things", "ignored", "unaveraged", "fewest")
+    _SUMS = ("confusion", "predicted", "true", "common")
 
     def __init__(
         self,
@@ -184,12 +162,11 @@ class TrackingQuality(Summed):
         unaveraged: Collection[int] = (),
         fewest: int = 0,
     ) -> None:
-        self.num_classes, self.things, self.ignored = (
-            num_classes,
-            frozenset(things),
-            frozenset(ignored),
-        )
-        self.unaveraged, self.fewest = frozenset(unaveraged), fewest
+        self.num_classes = num_classes
+        self.things = frozenset(things)
+        self.ignored = frozenset(ignored)
+        self.unaveraged = frozenset(unaveraged)
+        self.fewest = fewest
         self.reset()
 
     def reset(self) -> None:

@@ -80,11 +80,13 @@ class Uncertainty(Summed):
         free: id of free space.
     """
 
-    _SETTINGS, _SUMS = ("num_classes", "free"), ("sums", "nll", "ece")
+    _SETTINGS = ("num_classes", "free")
+    _SUMS = ("sums", "nll", "ece")
 
     def __init__(self, num_classes: int, *, free: int = 0) -> None:
         check_free(free, num_classes)
-        self.num_classes, self.free = num_classes, free
+        self.num_classes = num_classes
+        self.free = free
         self.reset()
 
     def reset(self) -> None:
@@ -120,7 +122,8 @@ class Uncertainty(Summed):
         counted = (
             np.ones(target.shape, np.bool_) if mask is None else to_numpy(mask).astype(np.bool_)
         )
-        prob, target = prob[counted].astype(np.float64), target[counted]
+        prob = prob[counted].astype(np.float64)
+        target = target[counted]
         off = np.abs(prob.sum(axis=1) - 1)
         if not (off <= _TOLERANCE).all() or (prob < 0).any():
             worst = int(np.nanargmax(np.where(np.isnan(off), np.inf, off))) if len(off) else 0
@@ -132,7 +135,8 @@ class Uncertainty(Summed):
             )
         check_ids("truth", target, self.num_classes)
         predicted = prob.argmax(axis=1)
-        confidence, right = prob.max(axis=1, initial=0.0), predicted == target
+        confidence = prob.max(axis=1, initial=0.0)
+        right = predicted == target
         loss = -np.log(prob[np.arange(len(target)), target] + _EPSILON)
         occupied = predicted != self.free
         for row, chosen in enumerate((~occupied, occupied)):

@@ -111,6 +111,7 @@ class ActorFollower:
         own: (6,) lower and upper corners of the parts of the recording vehicle, metres, sensor
             frame; known after `finish`.
         riders: the numbers of the actors that are such parts; known after `finish`.
+        replaced: the numbers of actors that were estimated again since: see `again`.
         seen: number of points of all scans so far.
     """
 
@@ -133,6 +134,7 @@ class ActorFollower:
         self.moved: dict[int, Int32Array] = {}
         self.own: list[FloatArray] = []
         self.riders: set[int] = set()
+        self.replaced: set[int] = set()
         self.seen = 0
         # in how many scans each cell has points, and in how many clusters
         self._near, self._freed = np.zeros((2, OWN_CELLS**3), np.int64)
@@ -187,10 +189,20 @@ class ActorFollower:
         return actors
 
     def finish(self) -> list[FoundActor]:
-        """Return the actors that have not ended, and find the parts of the recording vehicle. More
-        scans may come: they continue these actors under other numbers.
-        """
+        """Return the actors that have not ended, and find the parts of the recording vehicle."""
         actors = self._actors(self._alive)
+        self.find_own()
+        return [actor for actor in actors if actor.segments[0].instance not in self.riders]
+
+    def again(self, before_s: float, most: int) -> list[FoundActor]:
+        """Return some of the actors that have not ended, under new numbers: at most `most` of those
+        that began, or were estimated, before a time, and were seen since.
+        """
+        due = [one for one in self._alive if one.estimated_s < min(before_s, one.last.seconds)]
+        return self._actors(sorted(due, key=lambda one: one.estimated_s)[:most])
+
+    def find_own(self) -> None:
+        """Find the parts of the recording vehicle."""
         own = self._own_cells()
         beside = np.zeros_like(own)
         for number in self._beside:
@@ -207,7 +219,6 @@ class ActorFollower:
         for frame, members, cells in self._close:
             if wide[cells].all():  # found by their place
                 self.moved[frame] = np.setdiff1d(self.moved[frame], members)
-        return [actor for actor in actors if actor.segments[0].instance not in self.riders]
 
     def forget_before(self, frame: int) -> None:
         """Forget observations before a frame, but not those of how the last scans move."""
@@ -243,8 +254,13 @@ class ActorFollower:
     def _actors(self, chains: list[_ActorChain]) -> list[FoundActor]:
         actors, ground_m = [], float(np.median(self._grounds or [np.nan]))
         for one in chains:
+            if one.estimated_s == one.last.seconds:  # nothing was seen of it since
+                continue
+            self.replaced.add(one.number)
+            one.number, one.estimated_s = 0, one.last.seconds
             if actor := one.actor(self._deformable, self._number, self._label):
                 actors.append(actor)
+                one.number = self._number
                 self._cells[self._number] = one.cells()
                 self._beside += [self._number] if one.is_beside(ground_m) else []
                 self._number += 1
@@ -343,6 +359,8 @@ class _ActorChain:
 
     def __init__(self, first: _Link) -> None:
         self.links = [first]
+        # number of its last estimate, and its last observation then; before: 0, and the first one
+        self.number, self.estimated_s = 0, first.seconds
         self.velocity: FloatArray | None = (
             None  # (3,) m/s over the last observations; None for a single one
         )

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
@@ -214,11 +214,12 @@ def make_track(
     return Track(label, chain[0].instance, members, int(frames[0]), poses, speed, *whole)
 
 
-def complete_bodies(tracks: Sequence[Track]) -> list[Track]:
-    """Return tracks in order of their first segment, with bodies that similar actors complete where
-    they were not seen.
+def complete_bodies(tracks: Sequence[Track], others: Iterable[Track] = ()) -> list[Track]:
+    """Return tracks in order of their first segment, with bodies that similar actors, among them or
+    among others, complete where they were not seen.
     """
-    sizes = Sizes([(track.label, track.extent, track.surface) for track in tracks if track.rigid])
+    known = [track for track in (*tracks, *others) if track.rigid]
+    sizes = Sizes([(track.label, track.extent, track.surface) for track in known])
     whole = [_with_body(track, sizes) if track.rigid else track for track in tracks]
     return sorted(
         whole,

@@ -75,7 +75,8 @@ _KEPT_BYTES = 1 << 28  # of images
 _CELL_PX = 4.0  # least side of the cells in which points of a scan hide other points
 _FILLED = 1.0  # mean number of points of a scan in a cell
 # points that hide another are nearer by this share of the depth, and this distance
-_NEARER, _NEARER_M = 0.04, 0.3
+_NEARER = 0.04
+_NEARER_M = 0.3
 _HEIGHT_M = 1.5  # approximate height of a camera above the ground
 _REACH_CELLS = 2  # cells on each side that are searched for such points
 _RING = 0.5  # weight of all pixels around the pixel of a point, relative to this pixel
@@ -227,7 +228,8 @@ class PixelClasses:
                 data = path.read_bytes()
             return decode_image(data, str(path), camera, color=False)
         array = read_npy(path, ArrayFormat(NUMBERS, None))
-        size, is_float = (camera.height, camera.width), array.dtype.kind == "f"
+        size = (camera.height, camera.width)
+        is_float = array.dtype.kind == "f"
         if array.ndim != 2 + is_float or array.shape[:2] != size:
             raise FormatError(
                 path,
@@ -342,8 +344,11 @@ class _ShownSequence(PredictedSequence):
         """
         made = dict.fromkeys(PREDICTED_FIELDS, inputs.sequence.frames("points"))
         super().__init__(inputs.sequence, reader.target, by, made)
-        self.plan, self.feed = replace(inputs.plan, voting=Voting()), inputs.feed
-        self.actors, self.pixels, self.reader = inputs.actors, pixels, reader
+        self.plan = replace(inputs.plan, voting=Voting())
+        self.feed = inputs.feed
+        self.actors = inputs.actors
+        self.pixels = pixels
+        self.reader = reader
 
     def make(self, frame: int) -> dict[str, AnyArray]:
         """Return the classes of the points of a scan, and their field `probabilities`."""
@@ -362,7 +367,9 @@ class _ShownSequence(PredictedSequence):
         """Return the (N, C) weights of classes that images give to each point of a scan, by id in
         the table of the pixels.
         """
-        feed, spec, pose = self.feed, self.plan.spec, self.feed.pose(frame)
+        feed = self.feed
+        spec = self.plan.spec
+        pose = self.feed.pose(frame)
         flow = points_of_actors(feed, self.actors.between(frame, frame), frame)[1].astype(
             np.float64
         )

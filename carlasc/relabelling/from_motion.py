@@ -165,7 +165,8 @@ class _MovingSequence(DerivedSequence):
         if whole.metadata.classes.standing and "labels" in whole.fields():
             made["labels"] = whole.frames("labels")
         super().__init__(whole, {layout.METADATA: metadata.to_json()}, made=made)
-        self._feed, self.actors = feed, actors
+        self._feed = feed
+        self.actors = actors
 
     def make(self, frame: int) -> dict[str, AnyArray]:
         """Return the new fields of a frame, and its labels if they change."""
@@ -199,7 +200,8 @@ def points_of_actors(
     numbers = np.zeros(len(scan), np.uint32)
     if scan.instances is not None:  # points of moving actors get the numbers of tracks
         numbers[:] = np.where(np.isin(scan.instances, moving), 0, scan.instances)
-    flow, world = np.zeros((len(scan), 3)), transform_points(pose, scan.points)
+    flow = np.zeros((len(scan), 3))
+    world = transform_points(pose, scan.points)
     classes = feed.classes
     if scan.labels is not None and feed.trusts_ground_labels and classes.ground:
         ground = np.isin(scan.labels, sorted(classes.ground))
@@ -215,7 +217,8 @@ def points_of_actors(
     # Merging leaves out some points and sorts the others. Points are found again by their
     # coordinates: equal points have the same place among all points in order.
     both = np.concatenate([scan.points, feed.read(frame).points])
-    order, is_new = np.lexsort(both.T), np.ones(len(both), np.bool_)
+    order = np.lexsort(both.T)
+    is_new = np.ones(len(both), np.bool_)
     is_new[1:] = (both[order[1:]] != both[order[:-1]]).any(axis=1)
     place = np.empty(len(both), np.int64)
     place[order] = np.cumsum(is_new)
@@ -228,7 +231,8 @@ def points_of_actors(
         own |= np.isin(of_scan, of_merged[track.members.get(frame, [])])
         velocity = rotate_vectors(invert(pose), velocity_at(track, frame, settled[own], feed))
         is_fast = np.square(velocity).sum(axis=1) > feed.options.motion.min_speed_m_s**2
-        numbers[own], flow[own] = actors.numbers[number], np.where(is_fast[:, None], velocity, 0)
+        numbers[own] = actors.numbers[number]
+        flow[own] = np.where(is_fast[:, None], velocity, 0)
     return numbers, flow.astype(np.float32)
 
 

@@ -102,10 +102,12 @@ def label(
     """
     check_types(label, locals())
     began = time.perf_counter()
-    share, root = Share(as_source(source), run), Path(predictions)
+    share = Share(as_source(source), run)
+    root = Path(predictions)
     by = root.resolve().name if by is None else by
     table = None if classes is None else read_classes(classes)[0]
-    chosen, scans = FrameRange.of(frames), sequences_with_scans(share)
+    chosen = FrameRange.of(frames)
+    scans = sequences_with_scans(share)
     others = {place.rpartition("/")[2] for place in share.others} - {
         one.name for one in scans.values()
     }
@@ -169,7 +171,8 @@ def find_predictions(
                         found=f"{by_folder[parts].suffix} and {suffix}",
                     )
                 by_folder[parts] = PredictedFiles(Path(folder), suffix, tuple(numbers))
-    result, lacking = {}, []
+    result = {}
+    lacking = []
     for path, sequence in sequences.items():
         # names of splits and coordinates that do not belong to the sequence
         others = {*layout.SPLITS, *layout.COORDINATES} - {sequence.split, sequence.coordinates}
@@ -316,7 +319,8 @@ class PredictionReader:
         for k in range(min(_PAIRS, len(ids))):
             best = rest.argmax(axis=1)
             share = np.rint(np.clip(rest[rows, best], 0, 1) * layout.CERTAIN)
-            pairs[:, 2 * k], pairs[:, 2 * k + 1] = np.where(share > 0, ids[best], 0), share
+            pairs[:, 2 * k] = np.where(share > 0, ids[best], 0)
+            pairs[:, 2 * k + 1] = share
             rest[rows, best] = -1
         return pairs
 
@@ -370,7 +374,8 @@ class _LabelledSequence(PredictedSequence):
         super().__init__(
             whole, reader.target, by, dict.fromkeys(made, np.array(files.frames, np.int64))
         )
-        self.files, self.reader = files, reader
+        self.files = files
+        self.reader = reader
 
     def make(self, frame: int) -> dict[str, AnyArray]:
         """Return the labels of a frame, and the probabilities if the files have them."""

@@ -43,7 +43,9 @@ from carlasc.storage.shares import Share
 
 _RUN = 60  # number of scans in a run, for the mounting of the sensor
 # words for poses in carlasc.json
-_ESTIMATED, _REFINED, _LEFT = "kiss-icp", "refined", "left as given"
+_ESTIMATED = "kiss-icp"
+_REFINED = "refined"
+_LEFT = "left as given"
 
 
 @dataclass
@@ -105,7 +107,8 @@ def refine(
     began = time.perf_counter()
     if poses.refine == "never":
         raise ArgumentError("refine", expected="auto or always", found="'never'")
-    share, options = Share(as_source(source), run), FromScans(poses=poses)
+    share = Share(as_source(source), run)
+    options = FromScans(poses=poses)
     given = sequences_with_scans(share)
     for one in given.values():
         if not must_estimate(one, options):

@@ -76,7 +76,8 @@ class Versions:
 
 @cache
 def _digest_of_source() -> str:
-    root, digest = Path(__file__).parents[1], hashlib.sha256()
+    root = Path(__file__).parents[1]
+    digest = hashlib.sha256()
     for file in sorted(root.rglob("*.py")):
         digest.update(f"{file.relative_to(root).as_posix()}\0".encode() + file.read_bytes())
     return digest.hexdigest()[:8]
@@ -195,16 +196,20 @@ class _Tasks:
         import cloudpickle
 
         self.pending: deque[tuple[Any, Any]] = deque()
-        self._client, self._function, self._session = client, function, Session.of(client.id)
+        self._client = client
+        self._function = function
+        self._session = Session.of(client.id)
         self._dumps = cloudpickle.dumps
         self._killed = distributed.scheduler.KilledWorker
-        self._threads, self._counted = 1, -_COUNT_S
+        self._threads = 1
+        self._counted = -_COUNT_S
 
     @property
     def window(self) -> int:
         """Maximum number of submitted tasks. It grows when workers are added."""
         if time.monotonic() - self._counted > _COUNT_S:
-            self._threads, self._counted = sum(self._client.nthreads().values()), time.monotonic()
+            self._threads = sum(self._client.nthreads().values())
+            self._counted = time.monotonic()
         return max(AHEAD * self._threads, LEAST)
 
     def submit(self, items: list[Any]) -> None:

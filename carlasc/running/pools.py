@@ -51,7 +51,8 @@ class OwnProcesses(Executor):
     """
 
     def __init__(self, workers: int) -> None:
-        self._workers, self._pool = workers, _ProcessGroup(workers)
+        self._workers = workers
+        self._pool = _ProcessGroup(workers)
         self._tasks: dict[int, _RetriedTask] = {}
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -130,7 +131,9 @@ class _RetriedTask(Future[Any]):
         kwargs: dict[str, Any],
     ) -> None:
         super().__init__()
-        self._owner, self._call, self._attempt = pool, (function, args, kwargs), Future[Any]()
+        self._owner = pool
+        self._call = (function, args, kwargs)
+        self._attempt = Future[Any]()
 
     def start(self, pool: ProcessPoolExecutor) -> bool:
         """Start the task, and return whether the processes were alive. If not, the task is lost."""

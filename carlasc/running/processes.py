@@ -54,9 +54,12 @@ def run_all(
         CarlascError: an item is given up and `lost` is None, the worker processes of an executor of
             the caller died, or the connection to a cluster is lost.
     """
-    workers, executor, waiting = run.processes, run.executor, iter(items)
+    workers = run.processes
+    executor = run.executor
+    waiting = iter(items)
     first = list(islice(waiting, 2))
-    items, is_one = chain(first, waiting), len(first) < 2
+    items = chain(first, waiting)
+    is_one = len(first) < 2
     if not first:
         return
     if isinstance(executor, LazyClient):

@@ -20,7 +20,8 @@ class RayExecutor(Executor):
     """
 
     def __init__(self, ray: Any) -> None:
-        self._ray, self._session = ray, Session.of("ray")
+        self._ray = ray
+        self._session = Session.of("ray")
         self._task = ray.remote(max_retries=DEATHS - 1)(run_task)
 
     @property
@@ -31,7 +32,8 @@ class RayExecutor(Executor):
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Start a task."""
         call = self._ray.cloudpickle.dumps((partial(fn, **kwargs), *args))
-        future, task = Future[Any](), self._task.remote(self._session, call)
+        future = Future[Any]()
+        task = self._task.remote(self._session, call)
         future.add_done_callback(lambda one: self._ray.cancel(task) if one.cancelled() else None)
         task.future().add_done_callback(partial(self._pass_on, future))
         return future

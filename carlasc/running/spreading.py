@@ -204,7 +204,9 @@ class StepCounter:
     """
 
     def __init__(self, progress: Progress | None, total: int = 0, done: int = 0) -> None:
-        self._progress, self._done, self._total = progress, done, total
+        self._progress = progress
+        self._done = done
+        self._total = total
 
     def expect(self, more: int) -> None:
         """Add steps to the total."""
@@ -221,7 +223,8 @@ class StepCounter:
 
         `expected` of them are already in the total.
         """
-        before, total = self._done, self._total - expected
+        before = self._done
+        total = self._total - expected
 
         def advance(done: int, of: int) -> None:
             self._total = total + of

@@ -145,7 +145,8 @@ class NpzFile:
     """
 
     def __init__(self, archive: zipfile.ZipFile, where: str) -> None:
-        self._archive, self._where = archive, where
+        self._archive = archive
+        self._where = where
         self._members = {
             member.filename.removesuffix(".npy"): member for member in archive.infolist()
         }
@@ -167,7 +168,8 @@ class NpzFile:
             FormatError: the array does not exist, has another type, shape or size, has a
                 compression that NumPy does not use, or is damaged.
         """
-        member, where = self._members.get(name), f"{self._where}: {name}"
+        member = self._members.get(name)
+        where = f"{self._where}: {name}"
         if member is None:
             raise FormatError(
                 self._where,
@@ -273,7 +275,8 @@ def _check_header(
     with reading(where, "a .npy array"):
         shape, dtype = _npy_header(stream)
         start = stream.tell()
-    wanted, count = expected.shape, math.prod(shape)
+    wanted = expected.shape
+    count = math.prod(shape)
     # An empty array of shape (0,) is accepted as (0, K): CarlaSC has such files for an empty list
     # of actors.
     if shape == (0,) and wanted is not None and len(wanted) == 2:

@@ -110,7 +110,8 @@ def scan_T_camera(sequence: Sequence, camera: CameraModel, frame: int) -> Transf
     documents = sequence.documents()
     if camera.times is None or not {layout.TIMES, layout.POSES} <= set(documents):
         return camera.sensor_T_camera
-    times, poses = sequence.times, sequence.poses
+    times = sequence.times
+    poses = sequence.poses
     line = sequence.line_of(frame, len(times), layout.TIMES)
     where = f"{sequence.location}/{layout.CAMERAS}: {camera.name}, frame {frame}"
     if len(camera.times) != len(times):

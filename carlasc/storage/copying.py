@@ -85,7 +85,8 @@ def copy_blocks(blocks: Series[FrameBlock], run: Run, *, again: bool = False) ->
     todo = [
         block for block in (ours if again else [block.missing() for block in ours]) if block.files
     ]
-    total, files = sum(block.files for block in ours), 0
+    total = sum(block.files for block in ours)
+    files = 0
     step = StepCounter(run.progress, total)
     left = total - sum(block.files for block in todo)
     step(left)
@@ -165,7 +166,8 @@ def typical_rows(sequence: Sequence) -> dict[str, int]:
     """
     found: dict[str, int] = {}
     for name in sorted(sequence.fields()):
-        entry, frames = layout.field_named(name), sequence.frames(name)
+        entry = layout.field_named(name)
+        frames = sequence.frames(name)
         if entry.per in ("voxel", "box") or (
             entry.per == "point" and name != "points" and "points" in sequence.fields()
         ):

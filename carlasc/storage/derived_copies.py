@@ -92,7 +92,8 @@ class DerivedSequence(SequenceView):
             stale: fields that are left out.
         """
         super().__init__(whole)
-        self.texts, self.made = dict(texts), dict(made)
+        self.texts = dict(texts)
+        self.made = dict(made)
         self.kept = frozenset(name for name in whole.fields() - {*made, *stale} if "/" not in name)
         self._unread: dict[int, dict[str, AnyArray]] = {}
         self.left_out = {*stale} & whole.fields() | {f"{grid}/" for grid in whole.grids}
@@ -203,8 +204,11 @@ class DerivedCopy:
         """
         run.part.refuse(overwrite)
         refuse_overlap(out, source)
-        self.source, self.out, self.overwrite = source, out, overwrite
-        self.part, self.folder = run.part, Path(out)
+        self.source = source
+        self.out = out
+        self.overwrite = overwrite
+        self.part = run.part
+        self.folder = Path(out)
         self.partial, self.older = unfinished(self.folder), replaced(self.folder)
         # beside an unfinished copy; records its input and options
         self.mark: Path | None = None
@@ -352,7 +356,8 @@ def _link_files(sequence: DerivedSequence, folder: Path) -> int:
     """Make hard links to the unchanged files of a local folder, if the file system supports it, and
     return the number of new frame files.
     """
-    whole, count = sequence.whole, 0
+    whole = sequence.whole
+    count = 0
     if not isinstance(whole, FolderSequence):
         return 0
     paths = list(sequence.unchanged_documents())

@@ -197,9 +197,11 @@ def download(
         make_folder(folder)
         remove_stale(folder)
     done = {archive: _extracted_before(folder, archive) for archive in archives if extract}
-    fetches, needed = {}, 0
+    fetches = {}
+    needed = 0
     for archive in archives:
-        path, before = folder / archive.name, done.get(archive)
+        path = folder / archive.name
+        before = done.get(archive)
         if before is None:
             url = archive.url if base_url is None else f"{base_url.rstrip('/')}/{archive.name}"
             fetch = fetches[archive] = FileFetch(url, path, connections)
@@ -215,7 +217,8 @@ def download(
     for archive in archives:
         result = done.get(archive)
         if result is None:
-            path, fetch = folder / archive.name, fetches[archive]
+            path = folder / archive.name
+            fetch = fetches[archive]
             fetched = _fetch(path, fetch, progress, 2e9 * archive.gigabytes)
             result = Downloaded(archive.name, str(path), fetch.file.size, fetched)
             if extract:
@@ -252,7 +255,8 @@ def _fetch(path: Path, fetch: FileFetch, progress: Progress | None, most: float)
 def _extract(
     result: Downloaded, folder: Path, archive: Archive, keep: bool, progress: Progress | None
 ) -> Downloaded:
-    path, target = folder / archive.name, folder / archive.folder
+    path = folder / archive.name
+    target = folder / archive.folder
     files = extract_zip(path, target, StepCounter(progress, extracted_size(path)))
     if not keep:  # record the extraction, otherwise the next run would fetch the zip again
         write_json(_record(folder, archive), {"size": path.stat().st_size, "files": files})
@@ -270,7 +274,8 @@ def _extracted_before(folder: Path, archive: Archive) -> Downloaded | None:
         values = parse_json(record.read_bytes(), str(record))
     except FormatError:
         return None  # a power failure can leave an empty file: the zip is fetched again
-    size, files = values.get("size", -1), values.get("files", -1)
+    size = values.get("size", -1)
+    files = values.get("files", -1)
     if not all(type(count) is int and count >= 0 for count in (size, files)):
         found = f"{size!r} and {files!r}"
         raise FormatError(

@@ -122,7 +122,8 @@ class Field:
         """
         if self.kind in _LEVELS:
             return _decode_npz(self.kind, data, where, shape)
-        dtype, size = np.dtype(self.dtype or BOXES_DTYPE), len(data)
+        dtype = np.dtype(self.dtype or BOXES_DTYPE)
+        size = len(data)
         if shape is not None and size != self.size_of(shape):
             expected = f"{self.size_of(shape)} bytes ({' x '.join(map(str, shape))} {dtype.name})"
             raise damaged(
@@ -192,14 +193,16 @@ def _decode_npz(
     """Return the table of an .npz file: that one of its kind which has the types of the columns."""
     # The largest possible table: one row per voxel, and per class for votes.
     most = None if shape is None else math.prod(shape) * (_MOST_CLASSES if kind == "votes" else 1)
-    tables, columns = TABLES[kind], dict[str, AnyArray]()
+    tables = TABLES[kind]
+    columns = dict[str, AnyArray]()
     count: int | None = None
     with open_npz(data, where) as archive:
         for name in sorted(tables[0].names or (), key=_READ_FIRST.index):
             dtypes = tuple(table[name].base.str for table in tables)
             wanted = ArrayFormat(dtypes, (count, *tables[0][name].shape), most)
             columns[name] = archive.read(name, wanted)
-            count, most = len(columns[name]), None
+            count = len(columns[name])
+            most = None
     found = next(
         table for table in tables if all(table[n].base == c.dtype for n, c in columns.items())
     )

@@ -21,10 +21,8 @@ from carlasc.storage.transport.trees import LocalTarget, LocalTree, Target
 from carlasc.storage.voxel_files import find_voxels
 
 # end record of a zip without a comment, as NumPy writes it
-_ZIP_END, _ZIP_END_BYTES = (
-    b"PK\x05\x06",
-    22,
-)
+_ZIP_END = b"PK\x05\x06"
+_ZIP_END_BYTES = 22
 
 
 class FolderSource(PublishedSource):
@@ -170,7 +168,8 @@ class FolderWriter(SequenceWriter):
             return self._ends_as_zip(entry.file(frame), size)
         if entry.per == "point":
             other = layout.SCAN_FIELDS["labels" if field == "points" else "points"]
-            rows, beside = size / entry.row_bytes, self._size(other, frame)
+            rows = size / entry.row_bytes
+            beside = self._size(other, frame)
             return rows.is_integer() and (beside is None or beside / other.row_bytes == rows)
         return size > 0
 

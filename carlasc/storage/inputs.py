@@ -107,7 +107,8 @@ class SequenceFiles(FrameFiles):
     """
 
     def __init__(self, sequence: Sequence, *more: str) -> None:
-        self.sequence, tree = sequence, sequence.tree
+        self.sequence = sequence
+        tree = sequence.tree
         self.tree = tree if isinstance(tree, Tree) else None
         self.kind = more[0].partition("/")[0] if more else "scans"
         self.fields = sorted(sequence.fields() & {*layout.SCAN_FIELDS, *more})
@@ -276,7 +277,8 @@ def folder_states(places: Mapping[str, Path]) -> dict[str, str]:
     Args:
         places: folders or files, by the name that their states get.
     """
-    states, seen = dict[str, str](), set[str]()
+    states = dict[str, str]()
+    seen = set[str]()
     todo = [(name, str(place)) for name, place in places.items()]
     while todo:
         name, place = todo.pop()

@@ -411,7 +411,8 @@ class Metadata:
 
 def _read_axes(values: dict[str, Any], where: str) -> Axes:
     """Remove `axes` from the values of carlasc.json (`frame` in version 1), and return them."""
-    frame, axes = values.pop("frame", None), values.pop("axes", None)
+    frame = values.pop("frame", None)
+    axes = values.pop("axes", None)
     if frame is not None and frame not in _AXES:
         raise FormatError(where, expected=f"{' or '.join(_AXES)} in frame", found=repr(frame))
     if axes is not None and axes not in get_args(Axes):

@@ -28,7 +28,10 @@ VOXEL_SUFFIXES = (".npz", ".npy", ".label")  # of files that may be voxel grids 
 if TYPE_CHECKING:
     from carlasc.storage.zarr.zarr_sink import ZarrSink
 
-_ZIP, _EMPTY_ZIP, _HDF5, _PARQUET = b"PK\x03\x04", b"PK\x05\x06", b"\x89HDF\r\n\x1a\n", b"PAR1"
+_ZIP = b"PK\x03\x04"
+_EMPTY_ZIP = b"PK\x05\x06"
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_PARQUET = b"PAR1"
 _SIGNATURE = 8  # number of leading bytes that identify the kind of file
 
 

@@ -155,7 +155,8 @@ def pack(
         raise storage_error(result.out, error) from error
     packed = cast(PackedSource, open(out))
     result.published_bytes = result.published_bytes or packed.published_bytes()
-    result.stored_bytes, result.is_finished = packed.stored_bytes(), True
+    result.stored_bytes = packed.stored_bytes()
+    result.is_finished = True
     result.elapsed_s = time.perf_counter() - began
     return result
 

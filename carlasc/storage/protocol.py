@@ -440,12 +440,11 @@ class Sequence(ABC):
         rows = {"frames": len(self), "fields": fields} | {
             f"grid {name}": spec for name, spec in self.grids.items()
         }
-        picture, name = None, next(iter(self.grids), "")
+        picture = None
+        name = next(iter(self.grids), "")
         if f"{name}/labels" in self.fields():
-            first, palette = (
-                self.frames(f"{name}/labels").tolist()[0],
-                self.classes_of(name).palette,
-            )
+            first = self.frames(f"{name}/labels").tolist()[0]
+            palette = self.classes_of(name).palette
             labels = self.read(f"{name}/labels", first)
             left_handed = self.metadata.axes == "left"
             picture = self.grids[name].seen_from_above(labels, palette, left_handed=left_handed)
@@ -519,7 +518,9 @@ class Source(Mapping[str, Sequence]):
     def __bool__(self) -> bool:
         return True  # a store without sequences is a store
 
-    __eq__, __hash__ = object.__eq__, object.__hash__  # equality by identity: no data are read
+    # equality by identity: no data are read
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.location}>"
@@ -634,7 +635,8 @@ class SequenceWriter(ABC):
     def cells_of(self, grid: str) -> int | None:
         """Return the number of voxels of a grid from its params.json; None if it is not known."""
         name = layout.params_file(grid)
-        data, where = self.read_document(name), f"{self.location}/{name}"
+        data = self.read_document(name)
+        where = f"{self.location}/{name}"
         with suppress(FormatError):
             if data is not None:
                 return math.prod(GridSpec.from_params(parse_json(data, where), where).size)

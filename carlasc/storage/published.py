@@ -70,7 +70,8 @@ class PublishedSource(Source):
             found = "the files of one field"
             advice = "give the folder above this one"
         elif stores := sorted(name for name in entries if name.endswith(_CONTAINERS)):
-            found, advice = ", ".join(stores[:4]), "give one of these"
+            found = ", ".join(stores[:4])
+            advice = "give one of these"
         elif entries.get("raw"):
             found = "a raw capture"
             advice = "make grids of it first (carlasc regrid)"

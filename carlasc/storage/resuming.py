@@ -140,7 +140,8 @@ def _first_difference(existing: dict[str, Any], wanted: dict[str, Any]) -> str |
     there is none.
     """
     pairs = [(key, existing.get(key), wanted[key]) for key in wanted if key != RECORD]
-    old, new = existing[RECORD], wanted[RECORD]
+    old = existing[RECORD]
+    new = wanted[RECORD]
     pairs += [
         (f"{RECORD}.{key}", old.get(key), new.get(key)) for key in dict.fromkeys([*new, *old])
     ]

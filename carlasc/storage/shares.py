@@ -36,10 +36,12 @@ class Share(Source):
             whole: the source.
             run: how the work on the source is spread.
         """
-        self.whole, self.location = whole, whole.location
+        self.whole = whole
+        self.location = whole.location
         listed = read_list(run, whole.places) if run.is_share else [""]
         self.own, part = run.part.share(listed)
-        own, self.first = {*self.own}, listed[0]
+        own = {*self.own}
+        self.first = listed[0]
         self.others = [place for place in listed if place not in own]
         self.run = replace(run, part=part, sequences_from=None)
 

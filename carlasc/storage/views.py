@@ -17,7 +17,8 @@ class SequenceView(Sequence):
 
     def __init__(self, whole: Sequence) -> None:
         self.whole = whole
-        self.path, self.location = whole.path, whole.location
+        self.path = whole.path
+        self.location = whole.location
         self.split = whole.split
         self.name = whole.name
         self.coordinates = whole.coordinates
@@ -52,7 +53,8 @@ class ChosenSequences(Source):
     """A source with a selection of sequences, possibly views of the original ones."""
 
     def __init__(self, location: str, sequences: Mapping[str, Sequence]) -> None:
-        self.location, self.chosen = location, sequences
+        self.location = location
+        self.chosen = sequences
 
     def sequences(self) -> Mapping[str, Sequence]:
         """Return the sequences."""

@@ -177,12 +177,15 @@ class VoxelFrames(GridFrames):
         self, format: VoxelFormat, folder: Path, path: str, files: Mapping[str, Path]
     ) -> None:
         """Keep the files, which are in `folder` or in folders of their frames in it."""
-        self.format, self.path, self.location = format, path, str(folder)
+        self.format = format
+        self.path = path
+        self.location = str(folder)
         self.classes = format.classes
         self.named = format.named
         self.origin = format.origin
         self.spec = format.spec
-        self.files, self.names = files, sorted(files)
+        self.files = files
+        self.names = sorted(files)
 
     @cached_property
     def numbered(self) -> bool:
@@ -199,7 +202,8 @@ class VoxelFrames(GridFrames):
     def follow(self, truth: GridFrames) -> None:
         """Take the numbering of frames from the ground truth, unless both have numbers."""
         if isinstance(truth, VoxelFrames) and not (self.numbered and truth.numbered):
-            self.names, self.numbered = truth.names, truth.numbered
+            self.names = truth.names
+            self.numbered = truth.numbered
             vars(self).pop("_name", None)
 
     def only(self, names: list[str]) -> VoxelFrames:
@@ -259,7 +263,8 @@ class LabelFrames(VoxelFrames):
         """Keep the files. The geometry is that of the format if the size of the first file fits."""
         super().__init__(format, folder, path, files)
         first = files[self.names[0]]
-        size, invalid = first.stat().st_size, first.with_suffix(".invalid")
+        size = first.stat().st_size
+        invalid = first.with_suffix(".invalid")
         self.voxels: int | None = None
         if (counts := _counts_of(first)) is not None:
             self.voxels = counts.stat().st_size // 4
@@ -285,7 +290,8 @@ class LabelFrames(VoxelFrames):
         Raises:
             FormatError: the file size does not fit a grid.
         """
-        path, usual = self.file_of(frame), self.format.label_bytes
+        path = self.file_of(frame)
+        usual = self.format.label_bytes
         size = path.stat().st_size
         types: dict[float, np.dtype[np.unsignedinteger]] = {2: np.dtype("<u2"), 4: np.dtype("<u4")}
         width = usual if self.voxels is None else size / max(self.voxels, 1)
@@ -354,7 +360,8 @@ class VoxelSequence(Sequence):
         frames_of: the frames of each grid, by its name.
     """
 
-    split, coordinates = None, "cartesian"
+    split = None
+    coordinates = "cartesian"
 
     def __init__(self, path: str, frames_of: Mapping[str, GridFrames]) -> None:
         first = next(iter(frames_of.values()))
@@ -374,7 +381,9 @@ class VoxelSequence(Sequence):
         """Return the same files, read with another class table."""
         frames_of = {name: copy.copy(frames) for name, frames in self.frames_of.items()}
         for frames in frames_of.values():
-            frames.classes, frames.named = classes, "option"  # with the ids of the files
+            # with the ids of the files
+            frames.classes = classes
+            frames.named = "option"
         return VoxelSequence(self.path, frames_of)
 
     def follow(self, grid: str, truth: Sequence, truth_grid: str) -> None:
@@ -426,7 +435,8 @@ class VoxelSequence(Sequence):
             expected = f"{field} of frame {frame}"
             raise MissingDataError(self.location, expected=expected, found="none")
         name, _, part = field.rpartition("/")
-        grid, spec = self.frames_of[name], self._spec(name)
+        grid = self.frames_of[name]
+        spec = self._spec(name)
         where = f"{grid.location}: frame {grid.name_of(frame)}"
         if part == "seen":
             seen = grid.known(frame, "camera")
@@ -436,7 +446,8 @@ class VoxelSequence(Sequence):
             found = str(labels.size)
             expected = f"{spec.num_voxels} voxels ({spec})"
             raise FormatError(where, expected=expected, found=found)
-        labels, table = labels.reshape(spec.size), grid.classes or CARLASC11
+        labels = labels.reshape(spec.size)
+        table = grid.classes or CARLASC11
         counted = is_counted(labels, table)
         if part == "counts":
             known = grid.known(frame)
@@ -489,7 +500,8 @@ class VoxelSequence(Sequence):
         grid = self.frames_of[name]
         if grid.spec is not None:
             return grid.spec
-        expected, found = "a grid of known geometry", "files of another size"
+        expected = "a grid of known geometry"
+        found = "files of another size"
         if isinstance(grid, LabelFrames) and (usual := grid.format.spec) is not None:
             expected = f"{usual.num_voxels} voxels per frame, {usual}, as {grid.format.name} has"
             found, (x, y, _) = str(grid.voxels), usual.size
@@ -536,7 +548,8 @@ def matches(place: Path, template: str) -> Iterator[tuple[Path, dict[str, str]]]
     glob, expression = _patterns(template)
     parts = glob.split("/")
     for number in range(len(parts) + 1):
-        above, below = "/".join(parts[:number]), "/".join(parts[number:])
+        above = "/".join(parts[:number])
+        below = "/".join(parts[number:])
         if above and not place.match(above):
             continue
         paths = [place] if place.is_file() and not below else []
@@ -553,7 +566,8 @@ def matches(place: Path, template: str) -> Iterator[tuple[Path, dict[str, str]]]
 def _patterns(template: str) -> tuple[str, re.Pattern[str]]:
     """Return the glob pattern of a template, and an expression of its named parts."""
     first, *rest = re.split(r"\{(\w+)(?:=([^}]*))?\}", template)
-    glob, expression = first, _escaped(first)
+    glob = first
+    expression = _escaped(first)
     for name, pattern, text in zip(rest[::3], rest[1::3], rest[2::3], strict=True):
         glob += (pattern or "*") + text
         expression += f"(?P<{name}>[^/]+)" + _escaped(text)

@@ -82,7 +82,8 @@ class SourceContract:
     def test_has_the_same_fields_frames_and_bits(
         self, source: Source, expected: dict[str, Sequence], path: str
     ) -> None:
-        sequence, reference = source.sequences()[path], expected[path]
+        sequence = source.sequences()[path]
+        reference = expected[path]
         assert sequence.fields() == reference.fields()
         for name in reference.fields():
             frames = reference.frames(name)

@@ -220,7 +220,8 @@ class ConverterContract:
         self.run(source, tmp_path / "out")
         for path in (path for path in (tmp_path / "out").rglob("0*") if path.is_file()):
             # points are the last field that is read, and flow is the last field that is derived
-            number, folder = int(path.name[:6]), path.parent.name
+            number = int(path.name[:6])
+            folder = path.parent.name
             if (
                 number % 4 == 1
                 or (number % 4 == 2 and folder in ("velodyne", "predictions", "boxes"))

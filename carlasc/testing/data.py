@@ -25,7 +25,8 @@ FRAMES = (0, 1, 2, 5)
 """Frames of the sequence WHOLE."""
 SIZE, SECOND = (4, 6, 2), (8, 4, 3)
 """Sizes of the two grids."""
-FIRST_GRID, SECOND_GRID = "evaluation", "evaluation_8x4x3"
+FIRST_GRID = "evaluation"
+SECOND_GRID = "evaluation_8x4x3"
 
 WHOLE = "Train/Town01_Light/cartesian"
 SCANS = "Val/Town07_Heavy/cartesian"
@@ -63,7 +64,8 @@ def boxes(rng: np.random.Generator, count: int) -> Boxes:
     rotations = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
     rotations[np.linalg.det(rotations) < 0, :, 0] *= -1
     poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = rotations, rng.normal(scale=10, size=(count, 3))
+    poses[:, :3, :3] = rotations
+    poses[:, :3, 3] = rng.normal(scale=10, size=(count, 3))
     tracks = rng.permutation(1000)[:count].astype(np.uint32) + np.uint32(1)
     labels = rng.integers(1, 23, count).astype(np.uint32)
     sizes = rng.uniform(0.3, 5, (count, 3))
@@ -89,7 +91,8 @@ def evidence(
     classes = np.zeros(
         2 * voxels, field_files.WIDE_VOTES_DTYPE if wide else field_files.VOTES_DTYPE
     )
-    classes["voxel"], classes["label"] = np.repeat(np.arange(voxels), 2), np.tile([1, 10], voxels)
+    classes["voxel"] = np.repeat(np.arange(voxels), 2)
+    classes["label"] = np.tile([1, 10], voxels)
     shares = rng.integers(1, layout.CERTAIN, voxels)
     classes["votes"] = np.column_stack([shares, layout.CERTAIN - shares]).reshape(-1)
     return {
@@ -167,11 +170,9 @@ def write_dataset(root: Path, seed: int = 0) -> Path:
     for frame in (3, 4):
         _write_all(grids, frame, grid(rng, SIZE), FIRST_GRID)
     votes = np.zeros(5, field_files.VOTES_DTYPE)
-    votes["voxel"], votes["label"], votes["votes"] = (
-        [0, 1, 7, 20, 47],
-        [1, 2, 3, 22, 0],
-        [1, 300, 65535, 2, 1],
-    )
+    votes["voxel"] = [0, 1, 7, 20, 47]
+    votes["label"] = [1, 2, 3, 22, 0]
+    votes["votes"] = [1, 300, 65535, 2, 1]
     _write_all(grids, 4, {"votes": votes} | evidence(rng, SIZE), FIRST_GRID)
     for frame in FRAMES:
         fields = evidence(rng, SECOND, wide=True)
@@ -241,7 +242,8 @@ def wrong_labels(
         raise ArgumentError("share", expected="a number from 0 to 1", found=share)
     if clump_m is not None and not clump_m > 0:
         raise ArgumentError("clump_m", expected="a length above 0", found=clump_m)
-    result, places = labels.copy(), np.flatnonzero(labels)
+    result = labels.copy()
+    places = np.flatnonzero(labels)
     others = np.unique(labels[places] if classes is None else list(classes)).astype(labels.dtype)
     if not len(places) or not share:
         return result
@@ -263,7 +265,8 @@ def wrong_labels(
         chosen[order[above]] = True
         classes_of = np.array([rng.integers(0, len(others)) for rng in rngs])
         clump = clump.reshape(-1)
-        wrong, drawn = places[chosen[clump]], classes_of[clump[chosen[clump]]]
+        wrong = places[chosen[clump]]
+        drawn = classes_of[clump[chosen[clump]]]
     same = others[drawn] == labels[wrong]
     result[wrong] = others[(drawn + same) % len(others)]
     return result

@@ -161,12 +161,15 @@ class SimulatedDrive:
         poses = np.zeros((*at.shape, 4, 4))
         poses[..., 2, 2] = poses[..., 3, 3] = 1.0
         slope = 0.06 * np.cos(0.1 * x)
-        cos, sin = 1 / np.hypot(1, slope), slope / np.hypot(1, slope)
+        cos = 1 / np.hypot(1, slope)
+        sin = slope / np.hypot(1, slope)
         poses[..., 0, 0] = cos
         poses[..., 0, 1] = -sin
         poses[..., 1, 0] = sin
         poses[..., 1, 1] = cos
-        poses[..., 0, 3], poses[..., 1, 3], poses[..., 2, 3] = x, 0.6 * np.sin(0.1 * x), self.axle_m
+        poses[..., 0, 3] = x
+        poses[..., 1, 3] = 0.6 * np.sin(0.1 * x)
+        poses[..., 2, 3] = self.axle_m
         return poses
 
     def boxes(self, frame: int, labels: dict[str, int] | None = None) -> Boxes:
@@ -288,11 +291,13 @@ class SimulatedDrive:
                 start = (origins - thing.place(at)) @ turn
                 ray = directions @ turn
                 half = np.array(thing.size) / 2
-                one, other = (-half - start) / ray, (half - start) / ray
+                one = (-half - start) / ray
+                other = (half - start) / ray
                 enter = np.fmin(one, other).max(axis=1)
                 leave = np.fmax(one, other).min(axis=1)
                 nearer = (enter <= leave) & (enter > 0) & (enter < reach)
-                reach[nearer], hit[nearer] = enter[nearer], number
+                reach[nearer] = enter[nearer]
+                hit[nearer] = number
         return reach, hit
 
 

@@ -99,7 +99,8 @@ class StoreMachine(RuleBasedStateMachine):
 
     def teardown(self) -> None:
         """Remove all stores."""
-        self._sink, self._writers = None, {}
+        self._sink = None
+        self._writers = {}
         self._folder.cleanup()
 
     @rule(
@@ -146,7 +147,8 @@ class StoreMachine(RuleBasedStateMachine):
     @rule()
     def kill(self) -> None:
         """Abandon the sink and its writers without closing them, like a killed process."""
-        self._sink, self._writers = None, {}
+        self._sink = None
+        self._writers = {}
         self._killed = True
 
     @precondition(lambda self: self.model)
@@ -159,7 +161,8 @@ class StoreMachine(RuleBasedStateMachine):
             writer.close()
         if self._sink is not None:
             self._sink.finish()
-        self._sink, self._writers = None, {}
+        self._sink = None
+        self._writers = {}
         self.check()
         self._possible = {}
         if not self.reopens:

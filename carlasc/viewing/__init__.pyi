@@ -9,6 +9,7 @@ from .rendering.drawings import flow_drawing as flow_drawing
 from .rendering.drawings import grid_drawing as grid_drawing
 from .rendering.drawings import scan_drawing as scan_drawing
 from .rendering.overlays import overlay as overlay
+from .rendering.pictures import Look as Look
 from .rendering.pictures import Panel as Panel
 from .rendering.pictures import draw_panels as draw_panels
 from .rendering.pictures import render_comparison as render_comparison

@@ -29,7 +29,8 @@ def edges_of(size: AnyFloatArray) -> FloatArray:
     """Return the (13, 2, 3) ends of the edges of a box, and of a bar on its floor from its middle
     to its front, metres, frame of the box.
     """
-    corners, floor = _CORNERS * size, -size[2] / 2
+    corners = _CORNERS * size
+    floor = -size[2] / 2
     bar = np.array([(0.0, 0.0, floor), (size[0] / 2 + 0.8, 0.0, floor)])
     return np.array([*((corners[a], corners[b]) for a, b in _EDGES), bar])
 
@@ -65,7 +66,8 @@ def motion_arrows(moving: Scan) -> tuple[FloatArray, FloatArray]:
     _, group = np.unique(keys, axis=0, return_inverse=True)
     group = group.reshape(-1)
     count = np.bincount(group)
-    middle, vectors = _means(moving.points, group), _means(flow, group)
+    middle = _means(moving.points, group)
+    vectors = _means(flow, group)
     top = np.full(len(count), -np.inf)
     np.maximum.at(top, group, moving.points[:, 2])
     middle[:, 2] = top + 0.4

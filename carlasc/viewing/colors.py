@@ -56,7 +56,8 @@ ACTORS = ClassTable(
 )
 """Names and colours of actors by their numbers: `actor_ids` returns the ids."""
 ARROW = (20, 20, 24)
-EGO, GLASS = (250, 250, 250), (120, 132, 148)
+EGO = (250, 250, 250)
+GLASS = (120, 132, 148)
 UNLABELLED = (150, 150, 150)
 PATH = (70, 110, 170)
 

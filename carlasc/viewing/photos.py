@@ -19,7 +19,9 @@ from carlasc.storage.camera_files import (
 )
 from carlasc.storage.protocol import Sequence
 
-_PHOTO_PX, _FRUSTUM_M = 400, 1.0  # width of an image, and length of the drawn frustum of its camera
+# width of an image, and length of the drawn frustum of its camera
+_PHOTO_PX = 400
+_FRUSTUM_M = 1.0
 _QUALITY = (
     70  # of a JPEG: a third of the bytes of 90, and enough for an image of a few hundred pixels
 )
@@ -48,7 +50,8 @@ class Photo:
         """Return (8, 2, 3) lines of the frustum of the camera up to a depth, in the frame of the
         scan.
         """
-        width, height = self.camera.width, self.camera.height
+        width = self.camera.width
+        height = self.camera.height
         looks = self.camera.unproject([(0, 0), (width, 0), (width, height), (0, height)])
         corners = transform_points(
             self.ego_T_camera, depth_m * looks / np.linalg.norm(looks, axis=1, keepdims=True)
@@ -83,7 +86,8 @@ def photos_of(sequence: Sequence, frame: int, mirrored: bool) -> tuple[Photo, ..
     Raises:
         FormatError: the calibration is damaged.
     """
-    photos, mirror = [], np.diag([1.0, -1.0 if mirrored else 1.0, 1.0, 1.0])
+    photos = []
+    mirror = np.diag([1.0, -1.0 if mirrored else 1.0, 1.0, 1.0])
     for camera in cameras_of(sequence).values():
         place = (
             scan_T_camera(sequence, camera, frame) if has_image(sequence, camera, frame) else None

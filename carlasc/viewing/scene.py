@@ -219,7 +219,8 @@ def find_sequence(source: SceneSource, wanted: str | Sequence | None = None) -> 
     if (part := _open_part(source)) is not None:
         return part
     opened = as_source(source)
-    where, sequences = opened.location, opened.sequences()
+    where = opened.location
+    sequences = opened.sequences()
     if not sequences:
         raise MissingDataError(where, expected="a sequence", found="none")
     path, first = next(iter(sequences.items()))
@@ -229,12 +230,17 @@ def find_sequence(source: SceneSource, wanted: str | Sequence | None = None) -> 
     if isinstance(wanted, Sequence):
         if len(sequences) == 1:
             return NamedPart(first)
-        path, name, coordinates = wanted.path, wanted.name, wanted.coordinates
+        path = wanted.path
+        name = wanted.name
+        coordinates = wanted.coordinates
         expected = f"the sequence {name} ({coordinates})"
         advice = "give the folder of the sequence"
     else:
-        path, name, coordinates = wanted, wanted, None
-        expected, advice = f"the sequence {name}", ""
+        path = wanted
+        name = wanted
+        coordinates = None
+        expected = f"the sequence {name}"
+        advice = ""
     same_name = (
         sequence
         for sequence in sequences.values()
@@ -655,7 +661,8 @@ class SceneReader:
         """
         if scan is not None and scan.flow is not None:
             return scan.select(np.linalg.norm(scan.flow, axis=1) > 0)
-        data, name = self.data, f"{self.data.grid}/velocity"
+        data = self.data
+        name = f"{self.data.grid}/velocity"
         if not data.grid or frame not in data.frames_with(name):
             return None
         moving = data.sequence.read(name, frame)

@@ -153,7 +153,8 @@ def view(
             library that it needs is missing, or there is no screen.
     """
     check_types(view, locals())
-    started, scene = time.monotonic(), as_scene(source)
+    started = time.monotonic()
+    scene = as_scene(source)
     if scene.palette == "height":
         raise ArgumentError("palette", expected="class or colorblind", found="height")
     target = None if out is None else Path(out)
@@ -181,7 +182,8 @@ def view(
     if not recorded and not 0.01 <= thin_m <= 10:
         raise ArgumentError("thin_m", expected="0.01 to 10 metres", found=thin_m)
     content = open_content(scene, thin_m, beside, beside_grid)
-    frames, notes = content.frames, content.reader.notes
+    frames = content.frames
+    notes = content.reader.notes
     if ending and scene.frames is None and len(frames) > MAX_FRAMES:
         notes += (f"{len(frames)} frames found, showing the first {MAX_FRAMES}",)
         content = replace(content, frames=frames[:MAX_FRAMES])

@@ -30,11 +30,15 @@ KEYS = {
     "r": "reset the camera",
     "q, Esc": "close the window",
 }
-_RIGHT, _LEFT, _SPACE = 262, 263, 32  # key codes of GLFW
+# key codes of GLFW
+_RIGHT = 262
+_LEFT = 263
+_SPACE = 32
 _PAGE = 'or write a page instead with `out="page.html"`'
 _LIBRARIES = "libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0 libgomp1"  # Debian, Ubuntu
 # brightness of all faces, and what the direction of a face adds: 1 in all for a level face
-_BASE, _LIGHT = 0.75, (-0.05, 0.1, 0.25)
+_BASE = 0.75
+_LIGHT = (-0.05, 0.1, 0.25)
 
 
 class Window:
@@ -66,9 +70,12 @@ class Window:
             DependencyError: Open3D or a library that it needs is missing, or there is no screen.
         """
         self.reader = reader.right_handed()  # as Open3D is
-        self.position, self.look, self.playing = 0, 0, False
+        self.position = 0
+        self.look = 0
+        self.playing = False
         self.report = report or (lambda _: None)
-        self._due, self._shown = time.monotonic(), list[Any]()
+        self._due = time.monotonic()
+        self._shown = list[Any]()
         self._o3d: Any = import_open3d()
         self._visualizer = self._o3d.visualization.VisualizerWithKeyCallback()
         no_screen = sys.platform == "linux" and not (
@@ -142,7 +149,8 @@ class Window:
 
     def _draw(self) -> None:
         content = self.reader.read(self.reader.frames[self.position])
-        parts, shapes = [ego_vehicle()] if self.reader.shows_ego else [], []
+        parts = [ego_vehicle()] if self.reader.shows_ego else []
+        shapes = []
         if self.look < len(content.grids):
             grid = content.grids[self.look]
             colors = self.reader.panels[self.look].colors

@@ -24,9 +24,10 @@ from carlasc.core import CameraModel
 from carlasc.core.arrays import AnyFloatArray, FloatArray, IntArray, Uint32Array
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import translation
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError
 from carlasc_converters.argoverse2_classes import ARGOVERSE2, CATEGORIES, TO_CARLA
 from carlasc_converters.feather import read_columns
+from carlasc_converters.files import missing_scans, no_data
 from carlasc_converters.image_files import nearest_images
 from carlasc_converters.transforms import poses_of
 
@@ -44,7 +45,8 @@ _ASSUMED_M = (  # fact: argoverse2-lidar
 )
 _INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px")
 _NEAR_NS = 100_000_000  # an image that is farther from a frame in time does not belong to it
-_QUATERNION, _TRANSLATION = ("qw", "qx", "qy", "qz"), ("tx_m", "ty_m", "tz_m")
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_TRANSLATION = ("tx_m", "ty_m", "tz_m")
 _SIZE = ("length_m", "width_m", "height_m")
 
 
@@ -72,11 +74,10 @@ class Argoverse2(Converter):
             path.parents[1] for pattern in patterns for path in root.glob(pattern) if path.is_dir()
         }
         if not logs:
-            raise MissingDataError(
+            raise no_data(
                 self.source,
-                expected="logs: folders with sensors/lidar/ in them",
-                found="none" if root.is_dir() else "no such folder",
-                advice="give the folder that holds train/, val/ or test/, one of these, or one log",
+                "logs: folders with sensors/lidar/ in them",
+                "give the folder that holds train/, val/ or test/, one of these, or one log",
             )
         return [Argoverse2Log(log) for log in sorted(logs, key=lambda log: (log.name, str(log)))]
 
@@ -93,7 +94,9 @@ class Argoverse2Log(Recording):
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.name, self.location = folder, f"AV2_{folder.name}", str(folder)
+        self.folder = folder
+        self.name = f"AV2_{folder.name}"
+        self.location = str(folder)
         self.split = _SPLITS.get(folder.parent.name, "Train")
 
     @cached_property
@@ -294,16 +297,8 @@ class Argoverse2Log(Recording):
     def problems(self) -> list[tuple[int, str]]:
         """Return the annotated sweeps without a file that are between sweeps with files."""
         lidar = self.folder / "sensors" / "lidar"
-        errors = (
-            (
-                number,
-                MissingDataError(
-                    lidar / f"{at}.feather", expected="an annotated sweep", found="no such file"
-                ),
-            )
-            for number, at in self._missing[0]
-        )
-        return [(number, str(error)) for number, error in errors]
+        files = [(number, lidar / f"{at}.feather") for number, at in self._missing[0]]
+        return missing_scans(files, "an annotated sweep")
 
     def notes(self) -> list[str]:
         """Return notes on what is missing in the log."""
@@ -339,7 +334,8 @@ class Sweep(FrameHandle):
         """Read the points of each LiDAR, in the order of the file."""
         names = ("x", "y", "z", "intensity", "laser_number", "offset_ns")
         table = read_columns(Path(self.location), names)
-        count, lasers = len(table["x"]), table["laser_number"]
+        count = len(table["x"])
+        lasers = table["laser_number"]
         if not count:
             raise FormatError(
                 self.location, expected="points", found="an empty table", advice="download it again"

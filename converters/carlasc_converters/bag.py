@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -37,6 +37,7 @@ _AROUND_NS = 10**9  # a frame needs the motion of a LiDAR on the vehicle around 
 _WORLDS = ("odom", "map", "world")  # names of frames that do not move, the smoothest first
 
 
+@dataclass(eq=False)
 class Bag(Converter):
     """Reads bags of ROS 1 (.bag), ROS 2 (.db3, .mcap) and Foxglove (.mcap), without ROS."""
 
@@ -45,33 +46,27 @@ class Bag(Converter):
     classes = CARLA
     to_carla = None
 
-    def __init__(
-        self,
-        source: Path,
-        *,
-        topics: Annotated[
-            str | None,
-            "Topics of points, one per LiDAR, with commas. The messages of the first are the "
-            "frames.",
-        ] = None,
-        pose_topic: Annotated[
-            str | None, "Topic of the poses, or /tf. Needed only if there are several."
-        ] = None,
-        pose_frame: Annotated[
-            str | None, "Coordinate frame of the poses, if the messages do not name it."
-        ] = None,
-        world_frame: Annotated[
-            str | None, "Reference frame of poses from /tf, such as odom, map or world."
-        ] = None,
-        time_unit: Annotated[
-            TimeUnit, "Unit of the times of points. auto: from the duration of a scan."
-        ] = "auto",
-        deskewed: Annotated[
-            bool, "The points are already corrected for the motion of the vehicle."
-        ] = False,
-    ) -> None:
-        super().__init__(source)
-        self.options = BagOptions(topics, pose_topic, pose_frame, world_frame, time_unit, deskewed)
+    source: Path
+    _: KW_ONLY
+    topics: Annotated[
+        str | None,
+        "Topics of points, one per LiDAR, with commas. The messages of the first are the frames.",
+    ] = None
+    pose_topic: Annotated[
+        str | None, "Topic of the poses, or /tf. Needed only if there are several."
+    ] = None
+    pose_frame: Annotated[
+        str | None, "Coordinate frame of the poses, if the messages do not name it."
+    ] = None
+    world_frame: Annotated[
+        str | None, "Reference frame of poses from /tf, such as odom, map or world."
+    ] = None
+    time_unit: Annotated[
+        TimeUnit, "Unit of the times of points. auto: from the duration of a scan."
+    ] = "auto"
+    deskewed: Annotated[bool, "The points are already corrected for the motion of the vehicle."] = (
+        False
+    )
 
     def sequences(self) -> list[Recording]:
         """Return the recordings, by name.
@@ -81,19 +76,7 @@ class Bag(Converter):
             ArgumentError: one has several topics of points, and none is named.
             FormatError: a file is not a bag.
         """
-        return [BagRecording(BagFiles(paths), self.options) for paths in find_bags(self.source)]
-
-
-@dataclass(frozen=True)
-class BagOptions:
-    """The options of `Bag`; see there."""
-
-    topics: str | None = None
-    pose_topic: str | None = None
-    pose_frame: str | None = None
-    world_frame: str | None = None
-    time_unit: TimeUnit = "auto"
-    deskewed: bool = False
+        return [BagRecording(BagFiles(paths), self) for paths in find_bags(self.source)]
 
 
 class BagRecording(Recording):
@@ -108,10 +91,13 @@ class BagRecording(Recording):
 
     split = "Train"
 
-    def __init__(self, files: BagFiles, options: BagOptions) -> None:
-        self._files, self._options, self.location = files, options, files.location
+    def __init__(self, files: BagFiles, options: Bag) -> None:
+        self._files = files
+        self._options = options
+        self.location = files.location
         self.name = sequence_name(files.paths[0].name.split(".")[0].removesuffix("_0"))
-        self._pose_note, self._notes = "", list[str]()
+        self._pose_note = ""
+        self._notes = list[str]()
         self._lidars = [
             LidarTopic(topic, options.time_unit, deskewed=options.deskewed)
             for topic in files.clouds(options.topics)
@@ -146,7 +132,8 @@ class BagRecording(Recording):
             MissingDataError: there are several, and no transforms between them.
             FormatError: the points of one are in the frame of the world.
         """
-        tree, sensors = self._tree, list[Sensor]()
+        tree = self._tree
+        sensors = list[Sensor]()
         for lidar, motion in zip(self._lidars, self._motions, strict=True):
             if not tree.connected(lidar.frame, self._vehicle):
                 raise self._no_path(lidar.frame, self._vehicle, "convert one LiDAR with `topics`")
@@ -162,7 +149,8 @@ class BagRecording(Recording):
         Raises:
             FormatError: its frame does not belong to the vehicle.
         """
-        tree, motions = self._tree, list[tuple[IntArray, FloatArray] | None]()
+        tree = self._tree
+        motions = list[tuple[IntArray, FloatArray] | None]()
         for frame in (lidar.frame for lidar in self._lidars):
             known = tree.connected(frame, self._vehicle)
             stamps = tree.motion(self._vehicle, frame) if known else None
@@ -241,7 +229,8 @@ class BagRecording(Recording):
         """Return the cameras that transforms place on the vehicle, with the image nearest to each
         frame.
         """
-        cameras, stamps = list[CameraModel](), self._lidars[0].stamps
+        cameras = list[CameraModel]()
+        stamps = self._lidars[0].stamps
         for camera in self._cameras.values():
             if not self._tree.connected(camera.frame, self._vehicle):
                 note = (
@@ -360,7 +349,10 @@ class BagRecording(Recording):
 
         Of a topic of paths, the last message is read, which holds the whole path.
         """
-        places, errors, bad, good = list(topic.places()), list[FormatError](), list[str](), 0
+        places = list(topic.places())
+        errors = list[FormatError]()
+        bad = list[str]()
+        good = 0
         for place in places[-1:] if topic.channel.type == PATH else places:
             try:
                 placed = read_placed(place.read(), place.channel, str(place))
@@ -387,7 +379,8 @@ class BagRecording(Recording):
         """Return times and poses of the vehicle in the world; None if the vehicle does not move in
         the tree.
         """
-        line, wanted = self._tree.ancestors(self._vehicle), self._options.world_frame
+        line = self._tree.ancestors(self._vehicle)
+        wanted = self._options.world_frame
         world = next(
             (name for name in ((wanted,) if wanted else (*_WORLDS, line[-1])) if name in line), None
         )

@@ -77,7 +77,9 @@ class FileIndex:
     def add(self, channel: int, chunk: int, times: Any, offsets: Any) -> None:
         """Add messages of a channel that are in one chunk, or in none (-1)."""
         part = np.empty(np.size(times), PLACE)
-        part["time"], part["chunk"], part["offset"] = times, chunk, offsets
+        part["time"] = times
+        part["chunk"] = chunk
+        part["offset"] = offsets
         self._parts.setdefault(channel, []).append(part)
 
     def places(self, channel: int) -> AnyArray:
@@ -116,7 +118,8 @@ def decompressed(data: bytes, codec: str, where: str, size: int = MAX_UNPACKED) 
     module, name = _CODECS[codec]
     decoder = getattr(import_extra(module, EXTRA), name)
     check_size(size, where)
-    parts, left = list[bytes](), size
+    parts = list[bytes]()
+    left = size
     try:
         while data and left >= 0:  # a chunk may be several streams
             stream = decoder()
@@ -216,7 +219,8 @@ def read_cloud(data: bytes, channel: Channel, where: str) -> CloudMessage:
     with reading(where, f"a message of type {channel.type}"):
         if channel.type.startswith("foxglove."):
             return _foxglove_cloud(message, where)
-        stamp, frame = _stamp(message.header.stamp), _frame(message.header.frame_id)
+        stamp = _stamp(message.header.stamp)
+        frame = _frame(message.header.frame_id)
         if channel.type in _LIVOX:
             rows = [
                 (p.offset_time, p.x, p.y, p.z, p.reflectivity, p.tag, p.line)

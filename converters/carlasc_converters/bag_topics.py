@@ -46,7 +46,7 @@ from carlasc_converters.bag_messages import (
     read_stamp,
 )
 from carlasc_converters.files import opening, raw_advice
-from carlasc_converters.image_files import nearest_rows
+from carlasc_converters.image_files import nearest_within
 from carlasc_converters.point_fields import (
     TIMES,
     PointClock,
@@ -294,7 +294,8 @@ def _unzipped(path: Path) -> Path:
     folder = tempfile.TemporaryDirectory(prefix="carlasc-")
     atexit.register(folder.cleanup)
     with opening(path, "a zip archive of bags"), zipfile.ZipFile(path) as archive:
-        size, free = sum(entry.file_size for entry in archive.infolist()), disk_usage(folder.name)
+        size = sum(entry.file_size for entry in archive.infolist())
+        free = disk_usage(folder.name)
         if size > free.free:
             raise FormatError(
                 path,
@@ -342,7 +343,9 @@ class LidarTopic:
     """
 
     def __init__(self, topic: Topic, time_unit: TimeUnit, *, deskewed: bool) -> None:
-        self.name, self._topic, self._time_unit = topic.channel.topic, topic, time_unit
+        self.name = topic.channel.topic
+        self._topic = topic
+        self._time_unit = time_unit
         self._deskewed = deskewed
         self.notes: list[str] = []
         gaps = np.diff(np.sort(topic.times)) / 1e9
@@ -361,7 +364,8 @@ class LidarTopic:
 
         An unreadable message follows the one before it; reading its frame reports the error.
         """
-        times_read, places = list[int | None](), list(self._topic.places())
+        times_read = list[int | None]()
+        places = list(self._topic.places())
         for place in places:
             try:
                 times_read.append(read_stamp(place.read(), place.channel, str(place)))
@@ -404,7 +408,8 @@ class LidarTopic:
         Raises:
             FormatError: no message can be read.
         """
-        problem, messages = None, list[CloudMessage]()
+        problem = None
+        messages = list[CloudMessage]()
         for places in (self.places, self.places[: -_PROBES - 1 : -1]):
             for place in places:
                 try:
@@ -424,7 +429,8 @@ class LidarTopic:
         Raises:
             FormatError: they are not the times of a scan.
         """
-        given, scans = self._time_unit, [(one.columns, one.stamp_ns) for one in self._probes]
+        given = self._time_unit
+        scans = [(one.columns, one.stamp_ns) for one in self._probes]
         unit = (self._probes[0].time_unit or "auto") if given == "auto" else given
         clock = find_clock(scans, unit, self.name, needed=not self._deskewed)
         if clock is None:
@@ -453,17 +459,10 @@ class LidarTopic:
         """
         own = self.stamps
         reach = float(np.median(np.diff(own))) if len(own) > 1 else float("inf")
-        rows = np.searchsorted((own[:-1] + own[1:]) // 2, stamps)
-        near = np.abs(own[rows] - stamps) <= reach
-        if not near.all():
-            self.notes.append(
-                f"{self.name}: has no message near {np.count_nonzero(~near)} of {len(stamps)} "
-                f"frames"
-            )
-        return [
-            self.places[row] if there else None
-            for row, there in zip(rows.tolist(), near.tolist(), strict=True)
-        ]
+        rows = nearest_within(own, stamps, reach)
+        if far := rows.count(None):
+            self.notes.append(f"{self.name}: has no message near {far} of {len(stamps)} frames")
+        return [None if row is None else self.places[row] for row in rows]
 
 
 @dataclass(frozen=True)
@@ -514,7 +513,8 @@ class BagFrame(FrameHandle):
         seen = returns(message.columns)
         if not seen.any():
             raise FormatError(self.location, expected="points", found="none")
-        points, seconds = points[seen], None
+        points = points[seen]
+        seconds = None
         if message.pose is not None:
             points[:, :3] = transform_points(message.pose, points[:, :3])
         points[:, 3] = np.nan_to_num(points[:, 3])
@@ -594,13 +594,8 @@ class BagCamera:
         """Return the row of the image nearest to each of (F,) times, nanoseconds; None if it is
         nearer to another frame.
         """
-        times, _ = self.images
-        if not len(times):
-            return [None] * len(frames)
         period = float(np.median(np.diff(frames))) if len(frames) > 1 else np.inf
-        rows = nearest_rows(times, frames)
-        near = np.abs(times[rows] - frames) <= period / 2
-        return [row if ok else None for row, ok in zip(rows.tolist(), near.tolist(), strict=True)]
+        return nearest_within(self.images[0], frames, period / 2)
 
     def model(self, vehicle_T_camera: Transform, times: FloatArray | None) -> CameraModel:
         """Return the camera; images that the topic calls rectified have no distortion.
@@ -608,14 +603,17 @@ class BagCamera:
         Raises:
             FormatError: the model of its distortion is unknown, or numbers do not fit it.
         """
-        info, where = self.message, str(self.info)
+        info = self.message
+        where = str(self.info)
         with reading(where, "a message of type CameraInfo"):
             given = {
                 key: np.array(getattr(info, key.lower(), getattr(info, key, ())), np.float64)
                 for key in "DKP"
             }
-            kind, distortion = str(info.distortion_model), given["D"]
-            width, height = int(info.width), int(info.height)
+            kind = str(info.distortion_model)
+            distortion = given["D"]
+            width = int(info.width)
+            height = int(info.height)
             rectified = (
                 self.topic is not None
                 and "rect"
@@ -651,7 +649,8 @@ class BagCamera:
             FormatError: the image is cut short, or its encoding is not supported.
         """
         place = self.images[1][row]
-        message, where = decode(place.read(), place.channel, str(place)), str(place)
+        message = decode(place.read(), place.channel, str(place))
+        where = str(place)
         with reading(where, "an image"):
             data = np.asarray(message.data, np.uint8)
             if place.channel.type == COMPRESSED_IMAGE:
@@ -673,7 +672,8 @@ def find_cameras(files: BagFiles) -> list[BagCamera]:
     """Return the cameras of a bag, by the name of their topics; of several topics of images, the
     compressed one is read, because its messages are files.
     """
-    images, cameras = files.of_types(IMAGES), []
+    images = files.of_types(IMAGES)
+    cameras = []
     for topic in files.of_types((CAMERA_INFO,)):
         space = topic.channel.topic.rpartition("/")[0] + "/"
         own = [one for one in images if one.channel.topic.startswith(space)]

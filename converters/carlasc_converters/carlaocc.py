@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -31,21 +31,23 @@ from carlasc.core.benchmarks import CARLAOCC_TO_CARLA
 from carlasc.core.geometry import check_rigid
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLAOCC
-from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.errors import ArgumentError, FormatError
 from carlasc_converters.carlaocc_voxels import (
     CARLAOCC_GRIDS,
     read_geometry,
     read_voxels,
     sequence_name,
 )
-from carlasc_converters.files import opening, read_text
+from carlasc_converters.files import missing_scans, no_data, opening, read_text
 from carlasc_converters.ply import PlyVertices
 
 # the simulation runs at 10 frames per second, and the set's own loader gives frame i the time 0.1 i
 _PERIOD_S = 0.1  # fact: carlaocc-period
-_SCANS, _PROPERTIES = "semantic_lidar", ("x", "y", "z", "ObjIdx", "ObjTag")
+_SCANS = "semantic_lidar"
+_PROPERTIES = ("x", "y", "z", "ObjIdx", "ObjTag")
 
 
+@dataclass(eq=False)
 class CarlaOcc(Converter):
     """Reads CarlaOcc, or one of its sequences."""
 
@@ -61,16 +63,11 @@ class CarlaOcc(Converter):
     min_range_m = 2.5
     max_range_m = 70.0
 
-    def __init__(
-        self,
-        source: Path,
-        *,
-        voxels: Annotated[
-            str | None, "Grid that is read: a folder in occupancy/, such as vs_0_2_forward_view."
-        ] = None,
-    ) -> None:
-        super().__init__(source)
-        self.voxels = voxels
+    source: Path
+    _: KW_ONLY
+    voxels: Annotated[
+        str | None, "Grid that is read: a folder in occupancy/, such as vs_0_2_forward_view."
+    ] = None
 
     def sequences(self) -> list[Recording]:
         """Return the sequences, by name.
@@ -83,11 +80,10 @@ class CarlaOcc(Converter):
         if not folders and self.source.is_dir():
             folders = sorted(path for path in self.source.iterdir() if (path / _SCANS).is_dir())
         if not folders:
-            raise MissingDataError(
+            raise no_data(
                 self.source,
-                expected=f"folders such as Town01_Opt_Seq07 with {_SCANS}/ in them",
-                found="none",
-                advice="give the folder that holds them, after the archives are unpacked",
+                f"folders such as Town01_Opt_Seq07 with {_SCANS}/ in them",
+                "give the folder that holds them, after the archives are unpacked",
             )
         splits = _read_splits(folders[0].parent)
         existing = sorted(
@@ -122,7 +118,9 @@ class CarlaOccRecording(Recording):
     sensors = (Sensor("lidar", height_m=1.73),)
 
     def __init__(self, folder: Path, split: Split, grid: str | None) -> None:
-        self.folder, self.split, self.location = folder, split, str(folder)
+        self.folder = folder
+        self.split = split
+        self.location = str(folder)
         self.name = sequence_name(folder)
         self.grid = grid if grid is not None and (folder / "occupancy" / grid).is_dir() else None
 
@@ -181,20 +179,11 @@ class CarlaOccRecording(Recording):
 
     def problems(self) -> list[tuple[int, str]]:
         """Return the frames that have a grid, but no scan."""
-        scanned = {frame.number for frame in self.frames}
-        return [
-            (
-                number,
-                str(
-                    MissingDataError(
-                        self.folder / _SCANS / f"{number:04d}.ply",
-                        expected="a scan",
-                        found="no file",
-                    )
-                ),
-            )
-            for number in sorted(set(self._grid_files) - scanned)
-        ]
+        missing = sorted(self._grid_files.keys() - {frame.number for frame in self.frames})
+        folder = self.folder / _SCANS
+        return missing_scans(
+            [(number, folder / f"{number:04d}.ply") for number in missing], "a scan"
+        )
 
 
 @dataclass(frozen=True)
@@ -242,7 +231,8 @@ class CarlaOccFrame(FrameHandle):
         """
         if self.grid is None:
             return None
-        spec, expected = read_geometry(self.grid), read_geometry(self.reference)
+        spec = read_geometry(self.grid)
+        expected = read_geometry(self.reference)
         if spec != expected:
             raise FormatError(
                 self.grid,

@@ -9,13 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from carlasc.core.arrays import AnyArray, BoolArray, IntArray, LabelArray, Uint8Array
+from carlasc.core.arrays import BoolArray, IntArray, LabelArray, Uint8Array
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLAOCC
-from carlasc.errors import FormatError, MissingDataError
-from carlasc.storage.arrays import NUMBERS, ArrayFormat, check_size, open_npz
+from carlasc.errors import FormatError
+from carlasc.storage.arrays import NUMBERS, ArrayFormat, check_size
 from carlasc.storage.voxel_files import GridFrames, SeenBy, VoxelFormat
+from carlasc_converters.files import read_arrays
 
+_COPY = "the file is incomplete: copy it again"
 CARLAOCC_GRIDS = ("vs_0_4_surround_view", "vs_0_2_forward_view", "vs_0_1")
 """Names of grids. The first existing one is the default."""
 
@@ -28,11 +30,13 @@ class CarlaOccGrids(GridFrames):
         grid: name of the folder in `occupancy/`.
     """
 
-    classes, named = CARLAOCC, "format"
+    classes = CARLAOCC
+    named = "format"
     origin = (0.0, 0.0, 0.0)
 
     def __init__(self, folder: Path, grid: str) -> None:
-        self.path, self.location = sequence_name(folder), str(folder / "occupancy" / grid)
+        self.path = sequence_name(folder)
+        self.location = str(folder / "occupancy" / grid)
         self.files = {
             int(file.stem): file
             for file in Path(self.location).glob("[0-9]*.npz")
@@ -100,16 +104,17 @@ def read_voxels(path: str | Path, spec: GridSpec) -> tuple[Uint8Array, BoolArray
     Raises:
         FormatError: the file is not a grid of this geometry.
     """
-    rows = _read_arrays(path, {"occupancy": ArrayFormat(("<u2",), (None, 4), 4 * spec.num_voxels)})[
-        0
-    ]
+    rows = read_arrays(
+        path, {"occupancy": ArrayFormat(("<u2",), (None, 4), 4 * spec.num_voxels)}, _COPY
+    )[0]
     cells = rows[:, :3].astype(np.int64)
     if outside := int((cells >= spec.size).any(axis=1).sum()):
         raise FormatError(
             path, expected=f"voxels inside of {spec}", found=f"{outside} voxels outside"
         )
     semantic = semantic_ids(rows[:, 3])
-    labels, known = np.zeros(spec.size, np.uint8), np.ones(spec.size, np.bool_)
+    labels = np.zeros(spec.size, np.uint8)
+    known = np.ones(spec.size, np.bool_)
     labels[tuple(cells.T)] = semantic
     known[tuple(cells[semantic == 0].T)] = False
     return labels, known
@@ -122,10 +127,8 @@ def semantic_ids(codes: LabelArray) -> Uint8Array:
     instance`. Most voxels belong to classes whose instance is always 0, and no label above 0 is a
     multiple of both numbers, so the formula can be determined from the labels.
     """
-    decimal, binary = (
-        int(np.count_nonzero(codes % 1000 == 0)),
-        int(np.count_nonzero(codes % 2048 == 0)),
-    )
+    decimal = int(np.count_nonzero(codes % 1000 == 0))
+    binary = int(np.count_nonzero(codes % 2048 == 0))
     return (codes // (1000 if decimal > binary else 2048)).astype(np.uint8)
 
 
@@ -136,8 +139,8 @@ def read_geometry(path: str | Path) -> GridSpec:
         FormatError: the file does not describe a grid.
     """
     few = ArrayFormat(NUMBERS, None, 3)
-    step, origin, size = _read_arrays(
-        path, dict.fromkeys(("voxel_size", "voxel_origin", "volume_size"), few)
+    step, origin, size = read_arrays(
+        path, dict.fromkeys(("voxel_size", "voxel_origin", "volume_size"), few), _COPY
     )
     try:
         lower = np.asarray(origin, np.float64).reshape(3)
@@ -146,7 +149,8 @@ def read_geometry(path: str | Path) -> GridSpec:
         check_size((x, y, z), np.dtype(np.uint8), str(path))
         # Rounded to decimals first, because the origin is float32 and the voxel size is not: the
         # bounds are then those of the documentation in float32, as with `--bounds`.
-        low, up = np.round(lower, 4).tolist(), np.round(lower + cells * float(step), 4).tolist()
+        low = np.round(lower, 4).tolist()
+        up = np.round(lower + cells * float(step), 4).tolist()
         return GridSpec(
             "cartesian", (x, y, z), (low[0], low[1], low[2]), (up[0], up[1], up[2])
         ).with_bounds(low, up)
@@ -156,12 +160,3 @@ def read_geometry(path: str | Path) -> GridSpec:
             expected="voxel_size, and 3 values of voxel_origin and volume_size",
             found=error,
         ) from error
-
-
-def _read_arrays(path: str | Path, formats: dict[str, ArrayFormat]) -> list[AnyArray]:
-    try:
-        with open_npz(path) as arrays:
-            return [arrays.read(name, expected) for name, expected in formats.items()]
-    except (MissingDataError, FormatError) as error:
-        error.advice = error.advice or "the file is incomplete: copy it again"
-        raise

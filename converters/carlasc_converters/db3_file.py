@@ -21,7 +21,9 @@ def index_file(path: Path) -> FileIndex:
     """Return the index of the messages of a file; of a file that is cut short, those that SQLite
     can still read.
     """
-    index, rows, size = FileIndex(str(path)), array("q"), path.stat().st_size
+    index = FileIndex(str(path))
+    rows = array("q")
+    size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(32)
     page = int.from_bytes(head[16:18], "big")

@@ -139,3 +139,44 @@ def read_arrays(
     except (MissingDataError, FormatError) as error:
         error.advice = error.advice or advice
         raise
+
+
+def no_data(source: Path, expected: str, advice: str) -> MissingDataError:
+    """Return the error of a converter that finds no recording at a place."""
+    found = "none" if source.exists() else "no such folder"
+    return MissingDataError(source, expected=expected, found=found, advice=advice)
+
+
+def missing_scans(
+    files: Iterable[tuple[int, Path]], expected: str, advice: str = ""
+) -> list[tuple[int, str]]:
+    """Return the problems of a recording whose frames lack files: number and message of each."""
+    found = "no such file"
+    return [
+        (number, str(MissingDataError(file, expected=expected, found=found, advice=advice)))
+        for number, file in files
+    ]
+
+
+def check_labels(labels: AnyArray, points: int, path: AnyPath) -> None:
+    """Check that a file has a label for each point.
+
+    Raises:
+        FormatError: it has another number of labels.
+    """
+    if len(labels) != points:
+        raise FormatError(
+            path,
+            expected=f"a label for each of {points} points",
+            found=len(labels),
+            advice="the file belongs to another scan, or is incomplete",
+        )
+
+
+def is_number(text: str) -> bool:
+    """Whether a text is a number."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

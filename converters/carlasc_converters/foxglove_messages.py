@@ -85,7 +85,8 @@ def _from_json(value: Any, kind: str) -> Any:
 
 
 def _from_protobuf(data: memoryview, kind: str) -> Any:
-    message, table = _empty(kind), _MESSAGES[kind]
+    message = _empty(kind)
+    table = _MESSAGES[kind]
     for number, value in _wire(data):
         if number in table:
             name, of = table[number]

@@ -22,6 +22,21 @@ def nearest_rows(stamps: IntArray, frames: IntArray) -> IntArray:
     return np.where(np.abs(stamps[after] - frames) < np.abs(frames - stamps[before]), after, before)
 
 
+def nearest_within(stamps: IntArray, frames: IntArray, within: float) -> list[int | None]:
+    """Return the row of the stamp nearest to each frame; None if it is farther away than `within`.
+
+    Args:
+        stamps: (N,) increasing.
+        frames: (F,) stamps of the frames, in the same unit.
+        within: the greatest distance.
+    """
+    if not len(stamps):
+        return [None] * len(frames)
+    rows = nearest_rows(stamps, frames)
+    near = np.abs(stamps[rows] - frames) <= within
+    return [row if ok else None for row, ok in zip(rows.tolist(), near.tolist(), strict=True)]
+
+
 def nearest_images(
     paths: Mapping[int, Path], frames: IntArray, within: int
 ) -> tuple[IntArray, BoolArray, tuple[str, ...]]:

@@ -81,7 +81,8 @@ def _is_number(value: object) -> bool:
 
 def _objects(path: Path) -> Iterator[dict[str, Any]]:
     """Yield the objects of a list."""
-    decode, count = json.JSONDecoder().raw_decode, 0
+    decode = json.JSONDecoder().raw_decode
+    count = 0
     with opening(path, _EXPECTED, _UNPACK), path.open(encoding="utf-8-sig") as file:
         text = file.read(_CHUNK).lstrip()
         if not text.startswith("["):
@@ -99,7 +100,8 @@ def _objects(path: Path) -> Iterator[dict[str, Any]]:
                     raise FormatError(
                         path, expected=_EXPECTED, found=found, advice=_UNPACK
                     ) from error
-                text, at = text[at:] + more, 0
+                text = text[at:] + more
+                at = 0
                 continue
             if not isinstance(row, dict):
                 raise FormatError(

@@ -27,7 +27,7 @@ from carlasc.core.geometry import Transform, check_rigid, inverse_of, multiply
 from carlasc.core.tables import REMAPS, SEMANTICKITTI
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import layout
-from carlasc_converters.files import read_bytes
+from carlasc_converters.files import check_labels, missing_scans, read_bytes
 from carlasc_converters.kitti_cameras import rectified_cameras
 from carlasc_converters.kitti_files import (
     HEIGHT_M,
@@ -39,7 +39,8 @@ from carlasc_converters.kitti_files import (
 )
 from carlasc_converters.kitti_voxels import GRID, read_voxel_files
 
-_TEST_FIRST, _VALIDATION = 11, 8
+_TEST_FIRST = 11
+_VALIDATION = 8
 
 
 class SemanticKitti(KittiConverter):
@@ -79,7 +80,9 @@ class KittiRecording(Recording):
     sensors = (Sensor("velodyne", height_m=HEIGHT_M),)
 
     def __init__(self, folder: Path, name: str, split: Split) -> None:
-        self.folder, self.name, self.split = folder, name, split
+        self.folder = folder
+        self.name = name
+        self.split = split
         self.location = str(folder)
         self.has_labels = self.has_instances = bool(frames_of(folder / "labels", ".label"))
         self.voxels = GRID if frames_of(folder / "voxels", ".label") else None
@@ -115,16 +118,20 @@ class KittiRecording(Recording):
             self.folder.parent.parent / "poses" / f"{self.folder.name}.txt",
         )
 
-    def _calibration(self, poses: Path, *, force: bool) -> Transform:
+    @cached_property
+    def _calib(self) -> Calibration | None:
         path = self.folder / "calib.txt"
-        calibration = Calibration.read(path) if path.is_file() else None
+        return Calibration.read(path) if path.is_file() else None
+
+    def _calibration(self, poses: Path, *, force: bool) -> Transform:
+        calibration = self._calib
         if calibration is not None and "Tr" in calibration.values:
             return calibration.transform("Tr")
         if force:
             return np.eye(4)
         error = MissingDataError if calibration is None else FormatError
         raise error(
-            path,
+            self.folder / "calib.txt",
             expected=f"Tr, which takes LiDAR points to the camera whose poses {poses.name} holds",
             found="no such file"
             if calibration is None
@@ -136,8 +143,7 @@ class KittiRecording(Recording):
 
     def cameras(self) -> Sequence[CameraModel]:
         """Return the rectified cameras of calib.txt; none without that file or Tr in it."""
-        path = self.folder / "calib.txt"
-        calibration = Calibration.read(path) if path.is_file() else None
+        calibration = self._calib
         if calibration is None or "Tr" not in calibration.values:
             return ()
 
@@ -162,14 +168,9 @@ class KittiRecording(Recording):
             *frames_of(self.folder / "labels", ".label"),
             *frames_of(self.folder / "voxels", ".label"),
         }
-        problems = []
-        for number in sorted(others - scanned):
-            file = self.folder / "velodyne" / f"{number:06d}.bin"
-            error = MissingDataError(
-                file, expected="a scan beside its labels", found="no such file"
-            )
-            problems.append((number, str(error)))
-        return problems
+        folder = self.folder / "velodyne"
+        files = [(number, folder / f"{number:06d}.bin") for number in sorted(others - scanned)]
+        return missing_scans(files, "a scan beside its labels")
 
 
 @dataclass(frozen=True)
@@ -193,13 +194,8 @@ class KittiFrame(FrameHandle):
         """Read points, classes and instances."""
         points = read_scan(self.location)
         labels, instances = self._read_labels()
-        if labels is not None and len(labels) != len(points):
-            raise FormatError(
-                self._label_file,
-                expected=f"a label for each of {len(points)} points",
-                found=len(labels),
-                advice="the file belongs to another scan, or is incomplete",
-            )
+        if labels is not None:
+            check_labels(labels, len(points), self._label_file)
         return [Cloud(points, labels, instances)]
 
     def _read_labels(self) -> tuple[Uint16Array | None, Uint32Array | None]:

@@ -17,8 +17,8 @@ from carlasc.converting import Cloud, FrameHandle, Recording, Sensor, Split, Tra
 from carlasc.core import CameraModel
 from carlasc.core.arrays import Float32Array, FloatArray, IntArray
 from carlasc.core.geometry import Transform, check_rigid, invert
-from carlasc.errors import FormatError, MissingDataError
-from carlasc_converters.files import Version, read_text, version_of
+from carlasc.errors import FormatError
+from carlasc_converters.files import Version, no_data, read_text, version_of
 from carlasc_converters.kitti360_classes import KITTI360, KITTI360_TO_CARLA
 from carlasc_converters.kitti360_labels import MAX_DISTANCE_M, label_points, window_at, windows_of
 from carlasc_converters.kitti_cameras import rectified_cameras
@@ -66,11 +66,10 @@ class Kitti360(KittiConverter):
             if path.is_dir()
         )
         if not folders:
-            raise MissingDataError(
+            raise no_data(
                 self.source,
-                expected=f"data_3d_raw/2013_05_28_drive_0000_sync/{_SCANS}/data/ and so on",
-                found="none" if source.is_dir() else "no folder",
-                advice="give the folder that holds data_3d_raw/, data_poses/ and calibration/",
+                f"data_3d_raw/2013_05_28_drive_0000_sync/{_SCANS}/data/ and so on",
+                "give the folder that holds data_3d_raw/, data_poses/ and calibration/",
             )
         return [Kitti360Drive(Kitti360Files(str(source), name)) for name in folders]
 
@@ -118,7 +117,8 @@ class Kitti360Drive(Recording):
     sensors = (Sensor("velodyne", deskewed=False),)
 
     def __init__(self, files: Kitti360Files) -> None:
-        self.files, self.location = files, str(files.scans.parent)
+        self.files = files
+        self.location = str(files.scans.parent)
         self.name = (
             f"KITTI360_{files.drive.removeprefix('2013_05_28_drive_').removesuffix('_sync')}"
         )
@@ -324,7 +324,8 @@ def _read_poses(path: Path) -> tuple[IntArray, FloatArray]:
 
 
 def _imu_T_lidar(folder: Path, force: bool) -> Transform:
-    to_pose, to_lidar = folder / "calib_cam_to_pose.txt", folder / "calib_cam_to_velo.txt"
+    to_pose = folder / "calib_cam_to_pose.txt"
+    to_lidar = folder / "calib_cam_to_velo.txt"
     if force and not (to_pose.is_file() and to_lidar.is_file()):
         return np.eye(4)
     purpose = "the place of the LiDAR on the car: poses.txt holds poses of the IMU"

@@ -122,7 +122,8 @@ def label_points(
         FormatError: a file is damaged, or its points have no labels.
         DependencyError: scipy is not installed.
     """
-    labels, instances = np.zeros(len(world), np.uint16), np.zeros(len(world), np.uint32)
+    labels = np.zeros(len(world), np.uint16)
+    instances = np.zeros(len(world), np.uint32)
     nearest = np.full(len(world), np.inf)
     moving = (
         _moving(str(folder / "dynamic" / window), frame)
@@ -134,10 +135,8 @@ def label_points(
         if cloud is not None:
             distances, indices = cloud.nearest(world)
             nearer = distances < nearest
-            labels[nearer], instances[nearer] = (
-                cloud.labels[indices[nearer]],
-                cloud.instances[indices[nearer]],
-            )
+            labels[nearer] = cloud.labels[indices[nearer]]
+            instances[nearer] = cloud.instances[indices[nearer]]
             nearest = np.minimum(nearest, distances)
     return labels, instances
 

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.converting import Converter
+from carlasc.converting import Cloud, Converter, FrameHandle
 from carlasc.core.arrays import AnyArray, AnyIntArray, Float32Array, FloatArray
 from carlasc.core.geometry import Transform, check_rigid
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.storage import layout
-from carlasc_converters.files import opening, read_text
+from carlasc_converters.files import is_number, opening, read_text
 
 HEIGHT_M = 1.73  # of the scanner above the ground, on KITTI's car
 _AGAIN = "copy it again"
@@ -97,6 +97,26 @@ def sweep_seconds(points: Float32Array, period_s: float) -> Float32Array:
     return (np.arctan2(points[:, 1], points[:, 0]) * (-period_s / (2 * np.pi))).astype(np.float32)
 
 
+@dataclass(frozen=True)
+class SweepFrame(FrameHandle):
+    """One scan of the raw data or of the tracking benchmark.
+
+    Attributes:
+        location: the file of its points.
+        number: its number.
+        period_s: time of one turn of the scanner, seconds.
+    """
+
+    location: str
+    number: int
+    period_s: float
+
+    def read(self) -> Sequence[Cloud]:
+        """Read the points, and find their times from their azimuths."""
+        points = read_scan(self.location)
+        return [Cloud(points, seconds=sweep_seconds(points, self.period_s))]
+
+
 def frames_of(folder: Path, suffix: str) -> list[int]:
     """Return the sorted frame numbers of a folder's files; none if the folder does not exist."""
     if not folder.is_dir():
@@ -136,8 +156,8 @@ class Calibration:
             name, colon, rest = line.partition(":")
             if not colon:
                 name, _, rest = line.partition(" ")
-                name, rest = ("", line) if _is_number(name) else (name, rest)
-            if all(map(_is_number, rest.split())):
+                name, rest = ("", line) if is_number(name) else (name, rest)
+            if all(map(is_number, rest.split())):
                 values[name.strip()] = [float(value) for value in rest.split()]
         return cls(path, values)
 
@@ -159,10 +179,8 @@ class Calibration:
         """Return the same for KITTI's raw data, whose files have a rotation `R` and a translation
         `T`.
         """
-        rotation, place = (
-            np.reshape(self._numbers(9, "R"), (3, 3)),
-            np.reshape(self._numbers(3, "T"), (3, 1)),
-        )
+        rotation = np.reshape(self._numbers(9, "R"), (3, 3))
+        place = np.reshape(self._numbers(3, "T"), (3, 1))
         return self._rigid(np.hstack([rotation, place]), "R, T")
 
     def _numbers(self, count: int, *names: str) -> list[float]:
@@ -251,7 +269,8 @@ class FrameTimes:
                 found=found,
                 advice=_AGAIN,
             )
-        numbers, stamps = numbers[known], stamps[known]
+        numbers = numbers[known]
+        stamps = stamps[known]
         seconds = cls(stamps[0], np.empty(0)).of(stamps)
         if not (np.diff(seconds) > 0).all():
             found = f"none at frame {numbers[int(np.argmin(np.diff(seconds))) + 1]}"
@@ -277,11 +296,3 @@ def _period(numbers: AnyIntArray, seconds: FloatArray) -> float:
         if len(seconds) > 1
         else layout.FRAME_PERIOD_S
     )
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

@@ -7,19 +7,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
-from carlasc.converting import Cloud, FrameHandle, Recording, Sensor, Split, Trajectory
+from carlasc.converting import FrameHandle, Recording, Sensor, Split, Trajectory
 from carlasc.core.arrays import FloatArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import Transform, invert
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError
+from carlasc_converters.files import no_data
 from carlasc_converters.kitti_boxes import KITTI, KITTI_TO_CARLA, ONLY_IN_VIEW
 from carlasc_converters.kitti_cameras import rectified_cameras
 from carlasc_converters.kitti_files import (
@@ -27,10 +27,9 @@ from carlasc_converters.kitti_files import (
     Calibration,
     FrameTimes,
     KittiConverter,
+    SweepFrame,
     frames_of,
-    read_scan,
     read_stamps,
-    sweep_seconds,
 )
 from carlasc_converters.oxts import read_packets, world_T_imu
 from carlasc_converters.tracklets import read_tracklets
@@ -61,12 +60,11 @@ class KittiRaw(KittiConverter):
                 path.parents[1].resolve() for path in self.source.glob(pattern) if path.is_dir()
             ):
                 return [RawDrive(folder) for folder in drives]
-        raise MissingDataError(
+        raise no_data(
             self.source,
-            expected=f"2011_09_26/2011_09_26_drive_0001_sync/{_SCANS}/data/ and so on, one date, "
+            f"2011_09_26/2011_09_26_drive_0001_sync/{_SCANS}/data/ and so on, one date, "
             f"or one drive",
-            found="none" if self.source.is_dir() else "no folder",
-            advice="give the folder that holds the dates",
+            "give the folder that holds the dates",
         )
 
 
@@ -82,7 +80,8 @@ class RawDrive(Recording):
     sensors = (Sensor("velodyne", deskewed=False, height_m=HEIGHT_M),)
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.location = folder, str(folder)
+        self.folder = folder
+        self.location = str(folder)
         match = _DRIVE.fullmatch(folder.name)
         self.name = f"KITTI_{match[1]}_{match[2]}" if match else f"KITTI_{folder.name}"
 
@@ -91,10 +90,9 @@ class RawDrive(Recording):
         """The frames that have a scan."""
         if not self._numbers:
             return []
-        return [
-            RawFrame(str(self.folder / _SCANS / "data"), number, self._times.period_s)
-            for number in self._numbers
-        ]
+        scans = self.folder / _SCANS / "data"
+        period_s = self._times.period_s
+        return [SweepFrame(f"{scans}/{n:010d}.bin", n, period_s) for n in self._numbers]
 
     @cached_property
     def _numbers(self) -> list[int]:
@@ -180,22 +178,3 @@ class RawDrive(Recording):
                 f"are interpolated"
             )
         return notes + ([ONLY_IN_VIEW] if (self.folder / "tracklet_labels.xml").is_file() else [])
-
-
-@dataclass(frozen=True)
-class RawFrame(FrameHandle):
-    """One scan."""
-
-    folder: str
-    number: int
-    period_s: float
-
-    @property
-    def location(self) -> str:  # type: ignore[override]
-        """The file of the points."""
-        return f"{self.folder}/{self.number:010d}.bin"
-
-    def read(self) -> Sequence[Cloud]:
-        """Read the points, and find their times from their azimuths."""
-        points = read_scan(self.location)
-        return [Cloud(points, seconds=sweep_seconds(points, self.period_s))]

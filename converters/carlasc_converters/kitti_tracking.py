@@ -6,29 +6,28 @@ See `docs/sets/kitti-tracking.md`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
-from carlasc.converting import Cloud, FrameHandle, Recording, Sensor, Split, Trajectory
+from carlasc.converting import FrameHandle, Recording, Sensor, Split, Trajectory
 from carlasc.core.arrays import FloatArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import Transform, invert
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError
+from carlasc_converters.files import no_data
 from carlasc_converters.kitti_boxes import KITTI, KITTI_TO_CARLA, ONLY_IN_VIEW, BoxRows, class_of
 from carlasc_converters.kitti_cameras import rectified_cameras
 from carlasc_converters.kitti_files import (
     HEIGHT_M,
     Calibration,
     KittiConverter,
+    SweepFrame,
     frames_of,
     read_lines,
-    read_scan,
-    sweep_seconds,
 )
 from carlasc_converters.oxts import read_packets, world_T_imu
 
@@ -73,12 +72,10 @@ class KittiTracking(KittiConverter):
                 for name in names
             ]
         if not recordings:
-            raise MissingDataError(
+            raise no_data(
                 self.source,
-                expected="training/velodyne/0000/ and so on, or one of the folders training and "
-                "testing",
-                found="none" if self.source.is_dir() else "no folder",
-                advice="give the folder that holds training/",
+                "training/velodyne/0000/ and so on, or one of the folders training and testing",
+                "give the folder that holds training/",
             )
         return recordings
 
@@ -95,13 +92,16 @@ class TrackingSequence(Recording):
     sensors = (Sensor("velodyne", deskewed=False, height_m=HEIGHT_M),)
 
     def __init__(self, folder: Path, number: str, name: str, split: Split) -> None:
-        self.folder, self.number, self.name, self.split = folder, number, name, split
+        self.folder = folder
+        self.number = number
+        self.name = name
+        self.split = split
         self.location = str(folder / "velodyne" / number)
 
     @cached_property
     def frames(self) -> Sequence[FrameHandle]:  # type: ignore[override]
         """The frames that have a scan."""
-        return [TrackingFrame(self.location, number) for number in self._numbers]
+        return [SweepFrame(f"{self.location}/{n:06d}.bin", n, PERIOD_S) for n in self._numbers]
 
     @cached_property
     def _numbers(self) -> list[int]:
@@ -122,7 +122,8 @@ class TrackingSequence(Recording):
         path = self._file("oxts")
         if not path.is_file():
             return None
-        packets, last = read_packets(path), self._numbers[-1]
+        packets = read_packets(path)
+        last = self._numbers[-1]
         by_order = len(packets) == len(self._numbers) <= last
         if len(packets) <= last and not by_order:
             raise FormatError(
@@ -192,7 +193,8 @@ class TrackingSequence(Recording):
             if row[2] == _IGNORED:
                 continue
             try:
-                frame, track = int(row[0]), int(row[1])
+                frame = int(row[0])
+                track = int(row[1])
                 height, width, length, x, y, z, turn = map(float, row[10:_COLUMNS])
             except ValueError as error:
                 raise FormatError(where, expected="numbers but in column 3", found=error) from error
@@ -213,24 +215,6 @@ class TrackingSequence(Recording):
         return [times, *view]
 
 
-@dataclass(frozen=True)
-class TrackingFrame(FrameHandle):
-    """One scan."""
-
-    folder: str
-    number: int
-
-    @property
-    def location(self) -> str:  # type: ignore[override]
-        """The file of the points."""
-        return f"{self.folder}/{self.number:06d}.bin"
-
-    def read(self) -> Sequence[Cloud]:
-        """Read the points, and find their times from their azimuths."""
-        points = read_scan(self.location)
-        return [Cloud(points, seconds=sweep_seconds(points, PERIOD_S))]
-
-
 def _camera_T_lidar(calibration: Calibration) -> Transform:
     """Return the (4, 4) transform from the LiDAR to the rectified frame of the first camera."""
     to_camera = calibration.transform("Tr_velo_to_cam", "Tr_velo_cam")
@@ -241,7 +225,8 @@ def _camera_T_box(center: FloatArray, turn_rad: float) -> Transform:
     """Return the pose of a box in the camera's frame (x right, y down, z forward), from its
     rotation about y.
     """
-    forward, up = np.array([np.cos(turn_rad), 0.0, -np.sin(turn_rad)]), np.array([0.0, -1.0, 0.0])
+    forward = np.array([np.cos(turn_rad), 0.0, -np.sin(turn_rad)])
+    up = np.array([0.0, -1.0, 0.0])
     pose = np.eye(4)
     pose[:3, :3] = np.stack([forward, np.cross(up, forward), up], axis=1)
     pose[:3, 3] = center

@@ -17,15 +17,24 @@ from carlasc_converters.bag_messages import Channel, FileIndex, decompressed, ro
 from carlasc_converters.files import Version, version_of
 
 MAGIC = b"\x89MCAP0\r\n"
-_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _END = 3, 4, 5, 6, 7, 15
-_HEAD, _MESSAGE_HEAD = 9, 22  # bytes before a record's content, and before the data of a message
+_SCHEMA = 3
+_CHANNEL = 4
+_MESSAGE = 5
+_CHUNK = 6
+_INDEX = 7
+_END = 15
+# bytes before a record's content, and before the data of a message
+_HEAD = 9
+_MESSAGE_HEAD = 22
 _ENTRY = np.dtype([("time", "<u8"), ("offset", "<u8")])
 
 
 def index_file(path: Path) -> FileIndex:
     """Return the index of the messages of a file."""
-    walk, size = _McapRecords(path), path.stat().st_size
-    at, ended = len(MAGIC), False
+    walk = _McapRecords(path)
+    size = path.stat().st_size
+    at = len(MAGIC)
+    ended = False
     with path.open("rb") as file:
         while at < size - len(MAGIC) or not ended:
             file.seek(at)
@@ -121,8 +130,10 @@ class _McapRecords:
 
     def end_chunk(self, *, whole: bool = True) -> None:
         """Add the messages of the last chunk, from its index if it is whole, or its content."""
-        chunk, entries = self.chunk, self._entries
-        self.chunk, self._entries = -1, []
+        chunk = self.chunk
+        entries = self._entries
+        self.chunk = -1
+        self._entries = []
         if chunk < 0:
             return
         if whole and entries and all(number in self.channels for number, _ in entries):

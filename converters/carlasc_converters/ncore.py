@@ -18,7 +18,7 @@ from carlasc.core.arrays import AnyArray, FloatArray, IntArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, check_rigid, invert, multiply, quaternions_of
 from carlasc.errors import FormatError, MissingDataError, count
-from carlasc_converters.files import opening, sequence_name
+from carlasc_converters.files import no_data, opening, sequence_name
 from carlasc_converters.kitti_boxes import BoxRows
 from carlasc_converters.ncore_cameras import NcoreCamera
 from carlasc_converters.ncore_classes import NCORE, NCORE_TO_CARLA, OTHER_OBJECT, class_of_name
@@ -28,7 +28,8 @@ from carlasc_converters.transforms import FrameTree, PlacedFrame
 _VERSION = "v4"
 _COMPONENT = "v1"
 _KINDS = ("lidars", "poses", "cuboids", "cameras", "intrinsics")
-_RIG, _WORLD = "rig", "world"
+_RIG = "rig"
+_WORLD = "world"
 _NS = 1000  # nanoseconds in a microsecond
 _ALONE_US = 50_000.0  # greatest distance in time from a single frame to the data that belong to it
 
@@ -63,11 +64,10 @@ class Ncore(Converter):
             stores[path.parent, str(about["sequence_id"])].append(store)
         recordings = [NcoreRecording(name, parts) for (_, name), parts in sorted(stores.items())]
         if not recordings:
-            raise MissingDataError(
+            raise no_data(
                 self.source,
-                expected=f"stores of NCore: {' or '.join(f'*{suffix}' for suffix in SUFFIXES)}",
-                found="none",
-                advice="check the path, or unpack the archives",
+                f"stores of NCore: {' or '.join(f'*{suffix}' for suffix in SUFFIXES)}",
+                "check the path, or unpack the archives",
             )
         return list(recordings)
 
@@ -88,7 +88,9 @@ class NcoreRecording(Recording):
     split = "Train"
 
     def __init__(self, name: str, stores: Sequence[NcoreStore]) -> None:
-        self.name, self.location, self._stores = sequence_name(name), str(stores[0].path), stores
+        self.name = sequence_name(name)
+        self.location = str(stores[0].path)
+        self._stores = stores
         if not self._lidars:
             raise MissingDataError(
                 self.location,
@@ -158,7 +160,7 @@ class NcoreRecording(Recording):
     @cached_property
     def _slack_us(self) -> float:
         """Half of the time between frames: data farther from a frame do not belong to it."""
-        ends = self._first[:, 1]
+        ends = self.ends_us
         return float(np.median(np.diff(ends))) / 2 if len(ends) > 1 else _ALONE_US
 
     @cached_property
@@ -166,7 +168,7 @@ class NcoreRecording(Recording):
         """The frames of the first LiDAR, each with the frames of the other ones that are nearest to
         it in time.
         """
-        ends = self._first[:, 1]
+        ends = self.ends_us
         parts: list[list[tuple[int, str, str]]] = [[] for _ in ends]
         for index, (name, (store, group)) in enumerate(self._lidars.items()):
             own = self._spans[name][:, 1]
@@ -200,7 +202,8 @@ class NcoreRecording(Recording):
                     edges[source].append(
                         (target, stamps, np.array([invert(pose) for pose in poses]))
                     )
-        tree, reached = FrameTree(self.location), list[str]()
+        tree = FrameTree(self.location)
+        reached = list[str]()
         waiting = [_WORLD if _WORLD in edges else _RIG]
         while waiting:
             parent = waiting.pop()
@@ -229,14 +232,10 @@ class NcoreRecording(Recording):
         Raises:
             MissingDataError: there are several, and no poses between them.
         """
-        at, sensors = self._first[:1, 1] * _NS, []
+        at = self.ends_us[:1] * _NS
+        sensors = []
         for name in self._lidars:
-            if not self._tree.connected(name, self.vehicle):
-                raise MissingDataError(
-                    self.location,
-                    expected=f"poses from {name} to {self.vehicle}",
-                    found=self._tree,
-                )
+            self._check_connected(name)
             sensors.append(
                 Sensor(name, self._tree.lookup(self.vehicle, name, at)[0], deskewed=False)
             )
@@ -244,7 +243,7 @@ class NcoreRecording(Recording):
 
     def times(self) -> FloatArray:
         """Return seconds after the first frame."""
-        return self._seconds(self._first[:, 1])
+        return self._seconds(self.ends_us)
 
     def _seconds(self, stamps_us: AnyArray) -> FloatArray:
         return (stamps_us - self._first[0, 1]) / 1e6
@@ -284,7 +283,8 @@ class NcoreRecording(Recording):
         annotated = sorted({frame for frame, _ in self._observations} - {-1})
         numbers: dict[str, int] = {}
         where = f"{self.location}: cuboids"
-        rows, seen = BoxRows(where, annotated), set[tuple[int, int]]()
+        rows = BoxRows(where, annotated)
+        seen = set[tuple[int, int]]()
         with opening(where, "observations of tracks"):
             for frame, entry in self._observations:
                 track = numbers.setdefault(entry["track_id"], len(numbers) + 1)
@@ -298,7 +298,8 @@ class NcoreRecording(Recording):
                     * _NS
                 )
                 vehicle_T_reference = self._between(entry["reference_frame_id"], stamps)
-                box, label = entry["bbox3"], class_of_name(entry["class_id"])
+                box = entry["bbox3"]
+                label = class_of_name(entry["class_id"])
                 pose = multiply(vehicle_T_reference, _pose_of(box["centroid"], box["rot"]))
                 size = np.array(box["dim"], np.float64)
                 rows.add(frame, track, OTHER_OBJECT if label is None else label, pose, size)
@@ -310,7 +311,8 @@ class NcoreRecording(Recording):
         if (component := self._component("intrinsics")) is None:
             return []
         store, group = component
-        images, cameras = self._components["cameras"], []
+        images = self._components["cameras"]
+        cameras = []
         for name in store.groups(f"{group}/cameras"):
             own, place = images.get(name, (store, f"cameras/{name}"))
             cameras.append(
@@ -322,13 +324,13 @@ class NcoreRecording(Recording):
     def _images(self) -> dict[str, list[int | None]]:
         """The row of the image of each frame, by camera."""
         return {
-            camera.name: camera.nearest(self._first[:, 1], self._slack_us)
-            for camera in self._cameras
+            camera.name: camera.nearest(self.ends_us, self._slack_us) for camera in self._cameras
         }
 
     def cameras(self) -> Sequence[CameraModel]:
         """Return the cameras with a model of the layout and with poses that lead to the vehicle."""
-        models, at = [], self._first[:1, 1] * _NS
+        models = []
+        at = self.ends_us[:1] * _NS
         for camera in self._cameras:
             if camera.unknown is None and self._tree.connected(camera.name, self.vehicle):
                 middles = self._seconds(camera.spans.mean(axis=1))
@@ -358,7 +360,8 @@ class NcoreRecording(Recording):
             if camera.unknown or not self._tree.connected(camera.name, self.vehicle)
         ]
         for kind in ("poses", "cuboids", "intrinsics"):
-            chosen, groups = self._component(kind), self._components[kind]
+            chosen = self._component(kind)
+            groups = self._components[kind]
             if others := [name for name, component in groups.items() if component != chosen]:
                 notes.append(f"several {kind}: only one was read, not {', '.join(others)}")
         if idle := sorted(self._components["lidars"].keys() - self._lidars.keys()):
@@ -378,25 +381,21 @@ class NcoreRecording(Recording):
 
     def _frame_at(self, stamp_us: int) -> int:
         """Return the frame that contains a time, or the nearest one; -1 if none is near."""
-        away = np.maximum(self._first[:, 0] - stamp_us, 0) + np.maximum(
-            stamp_us - self._first[:, 1], 0
-        )
+        away = np.maximum(self._first[:, 0] - stamp_us, 0) + np.maximum(stamp_us - self.ends_us, 0)
         frame = int(np.argmin(away))
         return frame if away[frame] <= self._slack_us else -1
 
+    def _check_connected(self, frame: str) -> None:
+        if not self._tree.connected(frame, self.vehicle):
+            expected = f"poses from {frame} to {self.vehicle}"
+            raise MissingDataError(self.location, expected=expected, found=self._tree)
+
     def _between(self, reference: str, stamps: IntArray) -> Transform:
         """Return (4, 4) from a frame at the second time to the rig at the first time."""
-        if not self._tree.connected(reference, self.vehicle):
-            raise MissingDataError(
-                self.location,
-                expected=f"poses from {reference} to {self.vehicle}",
-                found=self._tree,
-            )
+        self._check_connected(reference)
         root = self._tree.ancestors(self.vehicle)[-1]
-        now, then = (
-            self._tree.lookup(root, self.vehicle, stamps[:1])[0],
-            self._tree.lookup(root, reference, stamps[1:])[0],
-        )
+        now = self._tree.lookup(root, self.vehicle, stamps[:1])[0]
+        then = self._tree.lookup(root, reference, stamps[1:])[0]
         return multiply(invert(now), then)
 
 
@@ -450,12 +449,15 @@ class NcoreFrame(FrameHandle):
 
 def _pose_of(centroid: Sequence[float], angles_rad: Sequence[float]) -> Transform:
     """Return (4, 4) of a box: turned about the fixed axes x, y and z, in this order."""
-    pose, turn = np.eye(4), np.eye(3)
+    pose = np.eye(4)
+    turn = np.eye(3)
     for axis, angle in enumerate(angles_rad):
         one, (a, b) = np.eye(3), [k for k in range(3) if k != axis]
         sign = -1 if axis == 1 else 1
         one[a, a] = one[b, b] = np.cos(angle)
-        one[a, b], one[b, a] = -sign * np.sin(angle), sign * np.sin(angle)
+        one[a, b] = -sign * np.sin(angle)
+        one[b, a] = sign * np.sin(angle)
         turn = one @ turn
-    pose[:3, :3], pose[:3, 3] = turn, centroid
+    pose[:3, :3] = turn
+    pose[:3, 3] = centroid
     return pose

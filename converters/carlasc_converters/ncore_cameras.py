@@ -15,7 +15,7 @@ from carlasc.core.cameras import Lens
 from carlasc.core.geometry import Transform
 from carlasc.errors import FormatError
 from carlasc_converters.files import opening
-from carlasc_converters.image_files import nearest_rows
+from carlasc_converters.image_files import nearest_within
 from carlasc_converters.ncore_store import NcoreStore
 
 _ENDINGS = {"jpeg": "jpg", "jpg": "jpg", "png": "png"}
@@ -45,10 +45,8 @@ class NcoreCamera:
     @property
     def unknown(self) -> str | None:
         """Why its images cannot be projected; None if they can."""
-        kind, given = (
-            self.lens.get("camera_model_type"),
-            self.lens.get("camera_model_parameters", {}),
-        )
+        kind = self.lens.get("camera_model_type")
+        given = self.lens.get("camera_model_parameters", {})
         if kind not in ("opencv-pinhole", "opencv-fisheye"):
             return f"the model {kind}"
         if self.lens.get("external_distortion_type") or given.get("external_distortion_parameters"):
@@ -66,12 +64,7 @@ class NcoreCamera:
         """Return the row of the image whose middle is nearest to each of (F,) times, microseconds;
         None if none is near enough.
         """
-        if not len(self.spans):
-            return [None] * len(ends)
-        middles = self.spans.mean(axis=1).astype(np.int64)
-        rows = nearest_rows(middles, ends)
-        near = np.abs(middles[rows] - ends) <= within
-        return [row if ok else None for row, ok in zip(rows.tolist(), near.tolist(), strict=True)]
+        return nearest_within(self.spans.mean(axis=1).astype(np.int64), ends, within)
 
     def model(self, vehicle_T_camera: Transform, times: FloatArray | None) -> CameraModel:
         """Return the camera; `times` are those of the images of each frame, seconds.

@@ -114,7 +114,8 @@ class NcoreStore:
 
     def groups(self, parent: str) -> list[str]:
         """Return the sorted names of the groups in a group."""
-        before, after = f"{parent}/", "/.zgroup"
+        before = f"{parent}/"
+        after = "/.zgroup"
         within = (key for key in self._metadata if key.startswith(before) and key.endswith(after))
         names = (key[len(before) : -len(after)] for key in within)
         return sorted(name for name in names if name and "/" not in name)
@@ -134,7 +135,8 @@ class NcoreStore:
             )
         where = f"{self.path}: {name}"
         with opening(where, "an array of zarr version 2"):
-            shape, chunks = tuple(about["shape"]), tuple(about["chunks"])
+            shape = tuple(about["shape"])
+            chunks = tuple(about["chunks"])
             for size in (shape, chunks):
                 check_size(size, np.dtype(about["dtype"]), where)
             values = np.full(shape, about["fill_value"] or 0, np.dtype(about["dtype"]))
@@ -144,7 +146,8 @@ class NcoreStore:
                     expected="rows in order C without filters",
                     found=f"{about['order']}, {about['filters']}",
                 )
-            config, codec = about["compressor"], None
+            config = about["compressor"]
+            codec = None
             if config is not None:
                 if config["id"] not in _SIZES:
                     raise FormatError(where, expected="chunks of blosc", found=config["id"])
@@ -190,7 +193,9 @@ def _open(path: str, version: Version) -> NcoreStore:
 
 
 def _unpacked(data: bytes, where: Path) -> Any:
-    decoder, text, packed = lzma.LZMADecompressor(), bytearray(), len(data)
+    decoder = lzma.LZMADecompressor()
+    text = bytearray()
+    packed = len(data)
     while not decoder.eof:
         part = decoder.decompress(data, _STEP)
         if not part and decoder.needs_input:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from dataclasses import KW_ONLY, dataclass
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -16,6 +17,7 @@ from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc_converters.files import missing_scans, no_data
 from carlasc_converters.image_files import nearest_images
 from carlasc_converters.nuscenes_classes import MINI_VALIDATION, NUSCENES, TO_CARLA, VALIDATION
 from carlasc_converters.nuscenes_frames import NuScenesFrame
@@ -25,6 +27,7 @@ from carlasc_converters.transforms import poses_of
 _NEAR_US = 50_000  # greatest time between an image and its scan
 
 
+@dataclass(eq=False)
 class NuScenes(Converter):
     """Reads nuScenes with its point labels and instances (lidarseg and panoptic), if they are
     installed.
@@ -41,19 +44,14 @@ class NuScenes(Converter):
     min_range_m = 2.5
     max_range_m = 50.0
 
-    def __init__(
-        self,
-        source: Path,
-        *,
-        version: Annotated[
-            str | None, "Folder of the tables, if there are several, such as v1.0-mini."
-        ] = None,
-        sweeps: Annotated[
-            bool, "Read all scans, 20 per second; without it, only key frames, 2 per second."
-        ] = True,
-    ) -> None:
-        super().__init__(source)
-        self.version, self.sweeps = version, sweeps
+    source: Path
+    _: KW_ONLY
+    version: Annotated[
+        str | None, "Folder of the tables, if there are several, such as v1.0-mini."
+    ] = None
+    sweeps: Annotated[
+        bool, "Read all scans, 20 per second; without it, only key frames, 2 per second."
+    ] = True
 
     def sequences(self) -> list[Recording]:
         """Return the scenes with files, by name. This reads the tables.
@@ -65,13 +63,15 @@ class NuScenes(Converter):
         """
         tables = Tables(self._version())
         tables.check_categories()
-        root, names = tables.folder.parent, _Names()
+        root = tables.folder.parent
+        # each folder is listed once, because it may hold hundreds of thousands of files
+        names_in = cache(lambda folder: set(os.listdir(folder) if folder.is_dir() else ()))
         recordings: list[Recording] = []
         for scene in tables.scenes:
             present = {
                 scan.file
                 for scan in scene.scans
-                if (root / scan.file).name in names.of(root / scan.file)
+                if (file := root / scan.file).name in names_in(file.parent)
             }
             if present:
                 recordings.append(NuScenesScene(tables, scene, present, all_scans=self.sweeps))
@@ -87,17 +87,17 @@ class NuScenes(Converter):
 
     def _version(self) -> Path:
         """Return the folder of the tables."""
-        root, asked = self.source.resolve(), self.version
+        root = self.source.resolve()
+        asked = self.version
         if (root / "scene.json").is_file() and asked in (None, root.name):
             return root
         folders = sorted(path.parent for path in root.glob("v*/scene.json"))
         listed = ", ".join(folder.name for folder in folders)
         if not folders:
-            raise MissingDataError(
+            raise no_data(
                 self.source,
-                expected="v1.0-mini/scene.json, or another version",
-                found="none" if root.is_dir() else "no such folder",
-                advice="give the folder that holds v1.0-mini/, samples/ and sweeps/",
+                "v1.0-mini/scene.json, or another version",
+                "give the folder that holds v1.0-mini/, samples/ and sweeps/",
             )
         chosen = [folder for folder in folders if asked in (None, folder.name)]
         if len(chosen) != 1:
@@ -105,23 +105,6 @@ class NuScenes(Converter):
                 "version", expected=f"one of {listed}", found=repr(asked) if asked else "no choice"
             )
         return chosen[0]
-
-
-class _Names:
-    """The names of the files in folders.
-
-    Each folder is listed once, because it may hold hundreds of thousands.
-    """
-
-    def __init__(self) -> None:
-        self._folders: dict[Path, frozenset[str]] = {}
-
-    def of(self, file: Path) -> frozenset[str]:
-        """Return the names of the files in the folder of a file."""
-        folder = file.parent
-        if folder not in self._folders:
-            self._folders[folder] = frozenset(os.listdir(folder) if folder.is_dir() else ())
-        return self._folders[folder]
 
 
 class NuScenesScene(Recording):
@@ -143,20 +126,24 @@ class NuScenesScene(Recording):
             present: files of points that exist.
             all_scans: whether scans between key frames are frames, too.
         """
-        self.tables, self.scene = tables, scene
-        self.name, self.location = f"NUSC_{scene.name}", f"{tables.folder}: {scene.name}"
+        self.tables = tables
+        self.scene = scene
+        self.name = f"NUSC_{scene.name}"
+        self.location = f"{tables.folder}: {scene.name}"
         self.split = _split_of(scene.name, tables.folder.name)
         self._between = any(scan.sample < 0 and scan.file in present for scan in scene.scans)
         self._asked_for_all = all_scans
         chosen = [scan for scan in scene.scans if scan.sample >= 0 or (all_scans and self._between)]
-        self._scans, self._present = chosen, present
+        self._scans = chosen
+        self._present = present
         self.has_labels = any(scan.labels or scan.instances for scan in chosen)
         self.has_instances = any(scan.instances for scan in chosen)
 
     @cached_property
     def frames(self) -> Sequence[FrameHandle]:  # type: ignore[override]
         """The scans that exist."""
-        root, boxes = self.tables.folder.parent, self._boxes
+        root = self.tables.folder.parent
+        boxes = self._boxes
         sensor_T_vehicle = invert(self.sensors[0].vehicle_T_sensor)
         return [
             NuScenesFrame(
@@ -219,16 +206,15 @@ class NuScenesScene(Recording):
 
     def cameras(self) -> Sequence[CameraModel]:
         """Return the cameras of the scene, with the images nearest in time to each frame."""
-        root, models = self.tables.folder.parent, []
+        root = self.tables.folder.parent
+        models = []
         frames = np.array([scan.timestamp for scan in self._scans], np.int64)
         for token in sorted(
             {image.mount for image in self.scene.images},
             key=lambda one: self.tables.cameras[one].channel,
         ):
-            row, own = (
-                self.tables.cameras[token],
-                [image for image in self.scene.images if image.mount == token],
-            )
+            row = self.tables.cameras[token]
+            own = [image for image in self.scene.images if image.mount == token]
             nearest, near, images = nearest_images(
                 {image.timestamp: root / image.file for image in own}, frames, _NEAR_US
             )
@@ -281,25 +267,14 @@ class NuScenesScene(Recording):
 
     def problems(self) -> list[tuple[int, str]]:
         """Return the scans that the tables list and that have no file."""
-        root, advice = self.tables.folder.parent, "unpack the archives of the sensor data again"
-        missing = [
-            (number, scan.file)
+        root = self.tables.folder.parent
+        advice = "unpack the archives of the sensor data again"
+        files = [
+            (number, root / scan.file)
             for number, scan in enumerate(self._scans)
             if scan.file not in self._present
         ]
-        errors = (
-            (
-                number,
-                MissingDataError(
-                    root / file,
-                    expected="a LiDAR scan that the tables list",
-                    found="no such file",
-                    advice=advice,
-                ),
-            )
-            for number, file in missing
-        )
-        return [(number, str(error)) for number, error in errors]
+        return missing_scans(files, "a LiDAR scan that the tables list", advice)
 
     def notes(self) -> list[str]:
         """Return notes on what is missing in the scene."""

@@ -12,7 +12,7 @@ from carlasc.core.arrays import AnyArray, Float32Array, Uint16Array, Uint32Array
 from carlasc.core.boxes import Boxes
 from carlasc.errors import FormatError
 from carlasc.storage.arrays import ArrayFormat
-from carlasc_converters.files import read_arrays, read_bytes
+from carlasc_converters.files import check_labels, read_arrays, read_bytes
 from carlasc_converters.nuscenes_classes import NUSCENES
 
 _COLUMNS = 5  # x, y, z, intensity, ring
@@ -110,11 +110,5 @@ def _read_panoptic(path: str) -> Uint16Array:
 
 def _check_labels(labels: AnyArray, points: int, path: str) -> None:
     """Check that there is a class of the table for each point."""
-    if len(labels) != points:
-        raise FormatError(
-            path,
-            expected=f"a label for each of {points} points",
-            found=len(labels),
-            advice="the file belongs to another scan, or is incomplete",
-        )
+    check_labels(labels, points, path)
     NUSCENES.check(labels, path)

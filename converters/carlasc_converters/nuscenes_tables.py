@@ -229,8 +229,11 @@ class Tables:
         """The scenes, by name."""
         scans: dict[str, list[LidarScan]] = {}
         images: dict[str, list[ImageRow]] = {}
-        labels, instances = self._label_files("lidarseg"), self._label_files("panoptic")
-        samples, mounts, cameras = self._samples, self.mounts, self.cameras
+        labels = self._label_files("lidarseg")
+        instances = self._label_files("panoptic")
+        samples = self._samples
+        mounts = self.mounts
+        cameras = self.cameras
         keys = (
             "token",
             "sample_token",
@@ -304,12 +307,14 @@ class Tables:
         global frame, at LiDAR scans.
         """
         wanted = self._pose_rows if self.scenes else {}
-        timestamps, numbers = np.zeros(len(wanted), np.int64), np.full((len(wanted), 7), np.nan)
+        timestamps = np.zeros(len(wanted), np.int64)
+        numbers = np.full((len(wanted), 7), np.nan)
         for token, timestamp, position, rotation in read_rows(
             self.path("ego_pose"), ("token", "timestamp", *_POSE)
         ):
             if (row := wanted.get(token)) is not None:
-                timestamps[row], numbers[row] = timestamp, (*position, *rotation)
+                timestamps[row] = timestamp
+                numbers[row] = (*position, *rotation)
         if np.isnan(numbers).any():
             lacking = list(wanted)[int(np.argmax(np.isnan(numbers).any(axis=1)))]
             raise FormatError(
@@ -336,7 +341,10 @@ class Tables:
                     self.path("instance"), expected="a category_token of category.json", found=found
                 )
             objects[token] = len(objects), class_ids[category]
-        samples, instances, labels, numbers = array("i"), array("i"), array("I"), array("d")
+        samples = array("i")
+        instances = array("i")
+        labels = array("I")
+        numbers = array("d")
         path = self.path("sample_annotation")
         keys = ("sample_token", "instance_token", "translation", "size", "rotation")
         for sample, instance, position, size, rotation in read_rows(path, keys):

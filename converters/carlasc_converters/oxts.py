@@ -50,7 +50,9 @@ def world_T_imu(packets: FloatArray) -> FloatArray:
     latitude, and the rotation Rz(yaw) Ry(pitch) Rx(roll). The origin of the world is the position
     of the first packet.
     """
-    latitude, longitude, altitude = packets[:, 0], packets[:, 1], packets[:, 2]
+    latitude = packets[:, 0]
+    longitude = packets[:, 1]
+    altitude = packets[:, 2]
     scale = np.cos(np.radians(latitude[0])) * _EARTH_M
     east = scale * np.radians(longitude)
     north = scale * np.log(np.tan(np.pi / 4 + np.radians(latitude) / 2))
@@ -64,7 +66,8 @@ def world_T_imu(packets: FloatArray) -> FloatArray:
 
 def _about(axis: int, angles: FloatArray) -> FloatArray:
     """Return (K, 3, 3) rotations about an axis."""
-    one, other = (axis + 1) % 3, (axis + 2) % 3
+    one = (axis + 1) % 3
+    other = (axis + 2) % 3
     rotations = np.tile(np.eye(3), (len(angles), 1, 1))
     rotations[:, one, one] = rotations[:, other, other] = np.cos(angles)
     rotations[:, other, one] = np.sin(angles)

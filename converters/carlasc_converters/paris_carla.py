@@ -20,10 +20,12 @@ from carlasc.core.arrays import Float32Array, FloatArray, IntArray
 from carlasc.core.classes import Remap
 from carlasc.core.geometry import Transform, invert, rotation_z, transform_points, translation
 from carlasc.core.tables import CARLA
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError
+from carlasc_converters.files import no_data
 from carlasc_converters.ply import PlyVertices
 
-_POINT, _LIDAR = ("x", "y", "z"), ("x_lidar_position", "y_lidar_position", "z_lidar_position")
+_POINT = ("x", "y", "z")
+_LIDAR = ("x_lidar_position", "y_lidar_position", "z_lidar_position")
 _PROPERTIES = (*_POINT, *_LIDAR, "timestamp", "index_frame", "instance", "semantic")
 # as in the paper; all others: Train
 _SPLITS: dict[str, Split] = {
@@ -63,11 +65,10 @@ class ParisCarla3D(Converter):
             else sorted(p for p in source.rglob("*.ply") if p.stem.startswith("Town"))
         )
         if not files:
-            raise MissingDataError(
+            raise no_data(
                 source,
-                expected="files such as Town01.ply",
-                found="none",
-                advice="give their folder, after the archives are unpacked",
+                "files such as Town01.ply",
+                "give their folder, after the archives are unpacked",
             )
         return [ParisCarlaTown(path) for path in files]
 
@@ -83,11 +84,10 @@ class ParisCarlaTown(Recording):
     sensors = (Sensor("lidar"),)
 
     def __init__(self, path: Path) -> None:
-        self.path, self.location = path, str(path)
-        self.name, self.split = (
-            f"PARISCARLA_{path.stem.replace('_', '-')}",
-            _SPLITS.get(path.stem, "Train"),
-        )
+        self.path = path
+        self.location = str(path)
+        self.name = f"PARISCARLA_{path.stem.replace('_', '-')}"
+        self.split = _SPLITS.get(path.stem, "Train")
         self._ply = PlyVertices.open(path, _PROPERTIES)
         if self._ply.lines is not None:
             raise FormatError(path, expected="a binary PLY file", found="a text file")
@@ -125,7 +125,8 @@ class ParisCarlaTown(Recording):
         """
         positions, times = self._middles
         if (wrong := np.flatnonzero(~(np.diff(times) > 0))).size:
-            scan, later = self._scans[int(wrong[0])][0], self._scans[int(wrong[0]) + 1][0]
+            scan = self._scans[int(wrong[0])][0]
+            later = self._scans[int(wrong[0]) + 1][0]
             raise FormatError(
                 self.path,
                 expected="times that increase from scan to scan",
@@ -224,7 +225,8 @@ def headings(positions: FloatArray) -> FloatArray:
     after, at least a metre apart. A vehicle at rest keeps its last heading.
     """
     count = len(positions)
-    headings, frames = np.full(count, np.nan), np.arange(count)
+    headings = np.full(count, np.nan)
+    frames = np.arange(count)
     for away in range(1, _HEADING_FRAMES + 1):
         way = (
             positions[np.minimum(frames + away, count - 1), :2]
@@ -249,13 +251,17 @@ def _find_runs(ply: PlyVertices) -> tuple[IntArray, IntArray]:
     """
     values: list[IntArray] = []
     starts: list[IntArray] = []
-    done, runs, last = 0, 0, -1
+    done = 0
+    runs = 0
+    last = -1
     for chunk in ply.chunks():
         column = chunk["index_frame"].astype(np.int64)
         begins = np.flatnonzero(np.diff(column, prepend=last))
         values.append(column[begins])
         starts.append(begins + done)
-        done, runs, last = done + len(column), runs + len(begins), int(column[-1])
+        done = done + len(column)
+        runs = runs + len(begins)
+        last = int(column[-1])
         if runs > _MOST_RUNS:
             raise FormatError(
                 ply.path,

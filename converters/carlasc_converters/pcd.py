@@ -63,7 +63,9 @@ def read_pcd(path: str | Path) -> dict[str, AnyArray]:
     with opening(path, "a PCD file"), Path(path).open("rb") as file:
         header = _read_header(file, str(path))
         body = file.read()
-    where, row, count = str(path), header.row, header.points
+    where = str(path)
+    row = header.row
+    count = header.points
     if header.encoding == "ascii":
         try:
             rows = _rows_of_text(body, row) if body.strip() else np.empty(0, row)
@@ -98,7 +100,9 @@ def _read_header(file: BinaryIO, where: str) -> PcdHeader:
         if words and not words[0].startswith("#"):
             entries[words[0]] = words[1:]
     try:
-        names, sizes, kinds = entries["FIELDS"], list(map(int, entries["SIZE"])), entries["TYPE"]
+        names = entries["FIELDS"]
+        sizes = list(map(int, entries["SIZE"]))
+        kinds = entries["TYPE"]
         counts = list(map(int, entries.get("COUNT", ["1"] * len(names))))
         points = (
             int(entries["POINTS"][0])
@@ -152,7 +156,8 @@ def _unpacked(body: bytes, row: np.dtype[np.void], count: int, where: str) -> by
         raise FormatError(
             where, expected=f"{size} bytes in LZF compression", found="damaged ones", advice=COPY
         )
-    rows, start = np.empty(count, row), 0
+    rows = np.empty(count, row)
+    start = 0
     for name in row.names or ():
         width = row[name].itemsize * count
         kind, shape = row[name].subdtype or (row[name], ())
@@ -167,7 +172,8 @@ def _lzf(packed: Uint8Array, out: Uint8Array) -> int:
 
     The format: http://oldhome.schmorp.de/marc/liblzf.html.
     """
-    at, filled = 0, 0
+    at = 0
+    filled = 0
     while at < len(packed):
         control = int(packed[at])
         at += 1

@@ -76,7 +76,8 @@ class PlyVertices:
             offset = file.tell()
         count, properties = elements["vertex"]
         before = list(elements.values())[: list(elements).index("vertex")]
-        order, lists = _BYTE_ORDERS[kind], not all(map(_is_single, properties))
+        order = _BYTE_ORDERS[kind]
+        lists = not all(map(_is_single, properties))
         dtype = _row_type(list(takewhile(_is_single, properties)), order, str(path))
         if missing := [name for name in required if name not in (dtype.names or ())]:
             raise FormatError(
@@ -88,7 +89,8 @@ class PlyVertices:
         if kind == "ascii":
             skipped = sum(rows for rows, _ in before)
             return cls(str(path), dtype, count, offset, skipped, lists=lists)
-        start, size = offset, Path(path).stat().st_size
+        start = offset
+        size = Path(path).stat().st_size
         for element in before:
             start = int(_starts(str(path), start, element, order)[-1])
         vertices = cls(str(path), dtype, count, start)
@@ -207,7 +209,8 @@ def _read_header(file: BinaryIO, path: str) -> tuple[str, dict[str, tuple[int, _
         raise FormatError(
             path, expected='a PLY file, which begins with the line "ply"', found="something else"
         )
-    kind, elements = "", dict[str, tuple[int, _Properties]]()
+    kind = ""
+    elements = dict[str, tuple[int, _Properties]]()
     for line in iter(lambda: file.readline(_MAX_LINE), b""):
         words = line.decode("latin-1").split()
         try:
@@ -261,7 +264,8 @@ def _starts(path: str, start: int, element: tuple[int, _Properties], order: str)
         [np.dtype(_TYPES.get(kind, "V")).itemsize for kind in kinds.split()]
         for _, kinds in properties
     ]
-    data, starts = np.memmap(path, np.uint8, "r"), [start]
+    data = np.memmap(path, np.uint8, "r")
+    starts = [start]
     for _ in range(count):
         for first, *item in sizes:
             if item:

@@ -38,8 +38,11 @@ def read_columns(message: Any, where: str) -> dict[str, AnyArray]:
         (field.name, field.offset, f"{order}{ROS_TYPES.get(field.datatype, 'V')}", field.count)
         for field in message.fields
     ]
-    height, width, step = message.height, message.width, message.point_step
-    row_step, data = message.row_step, np.asarray(message.data, np.uint8)
+    height = message.height
+    width = message.width
+    step = message.point_step
+    row_step = message.row_step
+    data = np.asarray(message.data, np.uint8)
     if not row_step or len(data) == height * width * step:
         row_step = width * step  # some drivers fill it with other numbers
     if row_step < width * step or len(data) < height * row_step:
@@ -74,10 +77,8 @@ def unpack_fields(
     }
     for name, (offset, kind) in usable.items():
         if offset + kind.itemsize > step:
-            expected, found = (
-                f"points of {step} bytes",
-                f"the field {name} up to byte {offset + kind.itemsize}",
-            )
+            expected = f"points of {step} bytes"
+            found = f"the field {name} up to byte {offset + kind.itemsize}"
             raise FormatError(where, expected=expected, found=found)
     if not step or len(data) % step:
         raise FormatError(where, expected=f"points of {step} bytes", found=f"{len(data)} bytes")
@@ -201,9 +202,11 @@ def find_clock(
     problem: FormatError | None = None
     for choice in _time_columns(scans[0][0]):
         clock = replace(choice, needed=needed, unit=choice.unit if unit == "auto" else unit)
-        usual, found = choice.names[0] in TIMES, False
+        usual = choice.names[0] in TIMES
+        found = False
         for columns, stamp_ns in scans:
-            times, returned = clock.of(columns), returns(columns)
+            times = clock.of(columns)
+            returned = returns(columns)
             if times is None:
                 continue
             try:
@@ -214,7 +217,8 @@ def find_clock(
             duration = float(np.ptp(seconds)) if len(seconds) else 0.0
             if duration <= (0 if usual else _SCAN_S[0]):
                 continue  # such as the curvature of a surface
-            clock, found = replace(clock, unit=name), True
+            clock = replace(clock, unit=name)
+            found = True
             if start is not None:
                 own = stamp_ns is not None and abs(start - stamp_ns) > _CLOCK_S * 1e9
                 clock = replace(clock, absolute=True, own=clock.own or own)
@@ -362,7 +366,8 @@ def point_seconds(
     wanted = len(times) if returned is None else int(np.count_nonzero(returned))
     filled = known & (times != 0)
     if wanted < 2 * np.count_nonzero(filled) and (filled != known).any():
-        least, most = float(times[filled].min()), float(times[filled].max())
+        least = float(times[filled].min())
+        most = float(times[filled].max())
         if 10 * (most - least) < min(abs(least), abs(most)):
             known = filled  # the others were not filled in: a clock is not at 0
     if 0 < 2 * np.count_nonzero(known) <= wanted:
@@ -402,10 +407,12 @@ def point_seconds(
     usable = known | (np.abs(after) * (scale / 1e9) <= _LONGEST_S)
     if absolute or abs(float(first)) * scale / 1e9 > _CLOCK_S:
         # A clock's float64 seconds keep 0.2 microseconds; whole numbers keep all.
-        seconds, whole = after * (scale / 1e9), times.dtype.kind in "iu"
+        seconds = after * (scale / 1e9)
+        whole = times.dtype.kind in "iu"
         start = int(first) * scale if whole else round(float(first) * scale)
     else:
-        seconds, start = np.asarray(times, np.float64) * (scale / 1e9), None
+        seconds = np.asarray(times, np.float64) * (scale / 1e9)
+        start = None
     if not usable.all():
         places = np.flatnonzero(usable)
         seconds = np.interp(np.arange(len(times)), places, seconds[places])

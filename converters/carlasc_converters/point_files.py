@@ -14,7 +14,7 @@ import numpy as np
 from carlasc.core.arrays import AnyArray
 from carlasc.errors import ArgumentError, FormatError, import_extra
 from carlasc.storage.arrays import NUMBERS, ArrayFormat, open_npz, read_npy
-from carlasc_converters.files import COPY, opening, read_bytes
+from carlasc_converters.files import COPY, is_number, opening, read_bytes
 from carlasc_converters.pcd import read_pcd
 from carlasc_converters.ply import PlyVertices
 
@@ -73,7 +73,8 @@ def _read_bin(path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray
             found=len(data),
             advice=f"check `columns` ({','.join(columns)})",
         )
-    width, sample = len(columns), values[:_VALUES]
+    width = len(columns)
+    sample = values[:_VALUES]
     unlike = {
         number: _unlikeness(sample.reshape(-1, number))
         for number in {width, *range(3, _MOST_COLUMNS + 1)}
@@ -156,7 +157,7 @@ def _read_csv(path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray
         lines: Iterable[str] = file
         if separator == ";":
             lines = (line.replace(",", ".") for line in file)
-        if named := any(not _is_number(word.replace(",", ".")) for word in words):
+        if named := any(not is_number(word.replace(",", ".")) for word in words):
             columns = tuple(words)
         elif first:
             lines = chain([first.replace(",", ".") if separator == ";" else first], lines)
@@ -165,14 +166,6 @@ def _read_csv(path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray
     if named and not table.size:
         table = np.empty((0, len(words)))
     return _named(table, path, columns)
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _read_ply(path: Path, columns: tuple[str, ...] | None) -> dict[str, AnyArray]:

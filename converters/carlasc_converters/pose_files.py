@@ -27,7 +27,10 @@ PoseOf = Literal["sensor", "vehicle"]
 _Row = TypeVar("_Row")
 _Value = TypeVar("_Value")
 
-_TUM, _KITTI, _KITTI360 = 8, 12, (13, 17)  # numbers in a line
+# numbers in a line
+_TUM = 8
+_KITTI = 12
+_KITTI360 = (13, 17)
 _NAME = re.compile(
     r"(?:.*?[^\d.])??(?:(?:(?P<date>(?:19|20)\d\d(?:[-_]?\d\d){2}[-_T ]?\d\d(?:[-_:]?\d\d){2})"
     r"|(?P<seconds>[1-9]\d{8,9})(?=[-_]))(?:(?:(?P<point>\.)|[-_])(?P<rest>\d{1,9}))?"
@@ -98,13 +101,16 @@ def read_poses(path: Path) -> PoseRows:
         ]
         return _read_named(header, rows, path, of="vehicle")
     if rows and len(rows[0]) == _TUM:
-        table, stamps = _numbers(rows, _TUM, path), _stamps([row[0] for row in rows], path)
+        table = _numbers(rows, _TUM, path)
+        stamps = _stamps([row[0] for row in rows], path)
         return _rows_of(table[:, [1, 2, 3, 7, 4, 5, 6]], stamps, path, "sensor", ordered=False)
     if rows and len(rows[0]) in (_KITTI, *_KITTI360):
         width = len(rows[0])
-        table, numbers = _numbers(rows, width, path), None
+        table = _numbers(rows, width, path)
+        numbers = None
         if width != _KITTI:
-            numbers, table = table[:, 0].astype(np.int64), table[:, 1:13]
+            numbers = table[:, 0].astype(np.int64)
+            table = table[:, 1:13]
             if (np.diff(numbers) <= 0).any():
                 raise FormatError(path, expected="numbers of scans that increase", found="others")
         return PoseRows(_whole(table.reshape(-1, 3, 4), path), None, "sensor", numbers)
@@ -159,7 +165,8 @@ def _read_named(
             path, expected=f"the columns {', '.join(choices[0])} of {what}", found=", ".join(header)
         )
 
-    places, turns = columns(_PLACES, "the position"), columns(_TURNS, "the rotation")
+    places = columns(_PLACES, "the position")
+    turns = columns(_TURNS, "the rotation")
     times = next((header.index(name) for name in _TIMES if name in header), None)
     table = _numbers(rows, len(header), path)
     stamps = None if times is None else _stamps([row[times] for row in rows], path)
@@ -174,7 +181,8 @@ def _rows_of(
     With times, a few rows that are no poses are left out, and of rows with one time the last is
     taken.
     """
-    notes, where = list[str](), str(path)
+    notes = list[str]()
+    where = str(path)
     if stamps is not None:
         bad = ~are_poses(table)
         if bad.sum() > BAD_SHARE * len(table):
@@ -183,7 +191,8 @@ def _rows_of(
         for left, what in ((bad, "are no poses"), (again, "have the time of the next one")):
             if left.any():
                 notes.append(f"{where}: {left.sum()} of {len(left)} rows {what}, and are left out")
-        table, stamps = table[~(bad | again)], stamps[~(bad | again)]
+        table = table[~(bad | again)]
+        stamps = stamps[~(bad | again)]
     poses = poses_of(table[:, 3:], table[:, :3], where)
     other = None if ordered else poses_of(table[:, [4, 5, 6, 3]], table[:, :3], where)
     return PoseRows(poses, stamps, of, notes=tuple(notes), other=other)
@@ -197,7 +206,8 @@ def read_folders(folders: Sequence[Path]) -> PoseRows:
         MissingDataError: a file does not exist.
         FormatError: it has no time or pose.
     """
-    stamps, poses = list[int](), list[FloatArray]()
+    stamps = list[int]()
+    poses = list[FloatArray]()
     for folder in folders:
         path = folder / "data"
         with opening(path, "the time and the pose of a scan: stamp and estimate"):

@@ -19,7 +19,11 @@ from carlasc_converters.bag_messages import Channel, FileIndex, decompressed, ro
 from carlasc_converters.files import Version, version_of
 
 MAGIC = b"#ROSBAG V2.0\n"
-_MESSAGE, _HEADER, _INDEX, _CHUNK, _CONNECTION = 2, 3, 4, 5, 7
+_MESSAGE = 2
+_HEADER = 3
+_INDEX = 4
+_CHUNK = 5
+_CONNECTION = 7
 _LONGEST_HEADER = 1 << 20
 _EXPECTED = "a message in the chunk at byte {}"
 _ENTRY = np.dtype([("s", "<u4"), ("ns", "<u4"), ("offset", "<u4")])
@@ -29,8 +33,12 @@ _Fields = dict[bytes, bytes]
 
 def index_file(path: Path) -> FileIndex:
     """Return the index of the messages of a file."""
-    index, size = FileIndex(str(path)), path.stat().st_size
-    at, chunk, entries, closed = len(MAGIC), -1, list[tuple[int, RecordArray]](), False
+    index = FileIndex(str(path))
+    size = path.stat().st_size
+    at = len(MAGIC)
+    chunk = -1
+    entries = list[tuple[int, RecordArray]]()
+    closed = False
     with path.open("rb") as file:
         while at < size:
             try:
@@ -42,7 +50,8 @@ def index_file(path: Path) -> FileIndex:
                     closed = 0 < _number(fields, b"index_pos") <= size
                 elif kind == _CHUNK:
                     _add_chunk(index, chunk, entries)
-                    chunk, entries = at, []
+                    chunk = at
+                    entries = []
                 elif kind == _INDEX:
                     file.seek(begin)
                     entries.append(
@@ -106,8 +115,10 @@ def _add_chunk(index: FileIndex, chunk: int, entries: list[tuple[int, RecordArra
 
 def _scan_chunk(index: FileIndex, chunk: int) -> None:
     """Add the messages of a chunk from its content."""
-    times, offsets = dict[int, list[int]](), dict[int, list[int]]()
-    data, at = _read_chunk(index.path, chunk, version_of(index.path)), 0
+    times = dict[int, list[int]]()
+    offsets = dict[int, list[int]]()
+    data = _read_chunk(index.path, chunk, version_of(index.path))
+    at = 0
     for kind, fields, begin, end in _records(data, 0):
         number = _number(fields, b"conn")
         if kind == _CONNECTION:
@@ -132,7 +143,8 @@ def _read_chunk(path: str, at: int, version: Version) -> bytes:
     with Path(path).open("rb") as file:
         fields, begin, end = _record_at(file, at)
         file.seek(begin)
-        codec, size = fields[b"compression"].decode(), _number(fields, b"size")
+        codec = fields[b"compression"].decode()
+        size = _number(fields, b"size")
         return decompressed(file.read(end - begin), codec, path, size)
 
 
@@ -159,11 +171,13 @@ def _records(data: bytes, at: int) -> Iterator[tuple[int, _Fields, int, int]]:
 
 
 def _fields(header: bytes) -> _Fields:
-    fields, at = _Fields(), 0
+    fields = _Fields()
+    at = 0
     while at < len(header):
         (size,) = unpack_from("<I", header, at)
         name, _, value = header[at + 4 : at + 4 + size].partition(b"=")
-        fields[name], at = value, at + 4 + size
+        fields[name] = value
+        at = at + 4 + size
     return fields
 
 

@@ -17,7 +17,7 @@ from carlasc.core.geometry import Transform
 from carlasc.errors import FormatError
 from carlasc.relabelling.predictions import load
 from carlasc.storage.arrays import NUMBERS, ArrayFormat, read_npy
-from carlasc_converters.files import opening
+from carlasc_converters.files import check_labels, opening
 from carlasc_converters.point_fields import (
     PointClock,
     TimeUnit,
@@ -91,10 +91,12 @@ class ScanFile(FrameHandle):
                 expected=f"the fields of the first scan ({', '.join(self.fields)})",
                 found=", ".join(fields),
             )
-        points, seconds = fields["points"], None
+        points = fields["points"]
+        seconds = None
         if self.clock is not None:
             seconds = self.clock.seconds(columns, returns(columns), self.stamp, path)
-        labels, instances = fields.get("label"), fields.get("instance")
+        labels = fields.get("label")
+        instances = fields.get("instance")
         if self.labels is not None and index == 0:
             labels = read_labels(Path(self.labels), len(points))
         if not self.options.has_classes:
@@ -137,6 +139,5 @@ def read_labels(path: Path, count: int) -> Uint32Array:
         with opening(path, "a class id for each point"):
             values = np.loadtxt(path, ndmin=1)
     labels = whole_numbers(np.asarray(values).reshape(-1), str(path))
-    if len(labels) != count:
-        raise FormatError(path, expected=f"a label for each of {count} points", found=len(labels))
+    check_labels(labels, count, path)
     return labels

@@ -49,7 +49,8 @@ _GRAPH_SLAM = "cloud.pcd"  # hdl_graph_slam: a folder for each scan, with the fi
 _GROUND_M = 0.3  # ground must be at least this far below the sensor
 _NEARER = 1.05  # points that are farther from the viewpoint than from the origin by this are not
 # cosine of the tilt of poses that are right, and its difference to that of poses that are wrong
-_LEVEL, _CLEARLY = 0.9, 0.1
+_LEVEL = 0.9
+_CLEARLY = 0.1
 _SLACK = 10  # numbers of scans before the first pose or after the last one that get a pose
 _SLACK_NS = 10**9  # clocks of scans and poses that differ by more are others
 
@@ -124,7 +125,8 @@ class Scans(Converter):
             MissingDataError: there are no scans, or a LiDAR of the calibration has none.
             FormatError: scans have several formats, or LiDARs have different numbers of scans.
         """
-        options, lidars = self.options, dict[str, Transform]()
+        options = self.options
+        lidars = dict[str, Transform]()
         if options.calibration is not None:
             lidars = read_calibration(options.calibration)
         if len(lidars) > 1:
@@ -228,8 +230,11 @@ class ScanFolder(Recording):
         rig: dict[str, Transform],
         options: ScanOptions,
     ) -> None:
-        self.location, self.name = str(source), sequence_name(source.resolve().name)
-        self._files, self._rig, self._options = files, rig, options
+        self.location = str(source)
+        self.name = sequence_name(source.resolve().name)
+        self._files = files
+        self._rig = rig
+        self._options = options
         self.has_labels = options.label_dir is not None or (
             options.has_classes and "label" in self._first
         )
@@ -246,7 +251,8 @@ class ScanFolder(Recording):
         Raises:
             FormatError: no scan can be read.
         """
-        samples, problem = list[tuple[Path, dict[str, AnyArray]]](), None
+        samples = list[tuple[Path, dict[str, AnyArray]]]()
+        problem = None
         for paths in (self._paths, reversed(self._paths)):
             for path in paths:
                 try:
@@ -267,7 +273,8 @@ class ScanFolder(Recording):
     @cached_property
     def _clock(self) -> PointClock | None:
         """How the times of points are found; None if they have none."""
-        path, options = str(self._samples[0][0]), self._options
+        path = str(self._samples[0][0])
+        options = self._options
         scans = [(columns, None) for _, columns in self._samples]
         return find_clock(scans, options.time_unit, path, needed=not options.deskewed)
 
@@ -347,7 +354,8 @@ class ScanFolder(Recording):
                     found=f"{len(stamps)} times",
                 )
             return stamps, str(self._options.time_file)
-        rows, given = None if self._poses is None else self._poses.stamps, []
+        rows = None if self._poses is None else self._poses.stamps
+        given = []
         if self._clock is not None and self._clock.absolute:
             given.append((self._starts(self._clock), "the times of points"))
         if (names := stamps_of_names([path.stem for path in self._paths])) is not None:
@@ -374,7 +382,9 @@ class ScanFolder(Recording):
                     seen = returns(columns)
                     start = point_seconds(times, clock.unit, str(path), seen, absolute=True)[1]
                     found |= {} if start is None else {row: start}
-        first, rows, known = next(iter(found.values())), np.arange(len(self._paths)), list(found)
+        first = next(iter(found.values()))
+        rows = np.arange(len(self._paths))
+        known = list(found)
         after = np.interp(rows, known, [start - first for start in found.values()])
         period = after[known[-1]] / max(1, known[-1] - known[0])
         after += period * (rows - rows.clip(known[0], known[-1]))
@@ -470,7 +480,8 @@ class ScanFolder(Recording):
             for poses in (rows.world_T_body, rows.other)
         )
         assert world_T_vehicle is not None
-        stamps, where = self._stamps[0], str(self._options.pose_file or self.location)
+        stamps = self._stamps[0]
+        where = str(self._options.pose_file or self.location)
         if rows.numbers is not None:
             return Trajectory(self._by_number(rows.numbers, world_T_vehicle), where=where)
         if rows.stamps is None or stamps is None:
@@ -525,7 +536,8 @@ class ScanFolder(Recording):
 
     def notes(self) -> list[str]:
         """Return notes on what was found and assumed, and on what is not read."""
-        options, notes = self._options, list(self._poses.notes if self._poses else ())
+        options = self._options
+        notes = list(self._poses.notes if self._poses else ())
         if left := unread(self._samples[0][1], self._clock, classes=True):
             notes.append(f"the columns {', '.join(left)} of points were not read")
         if self._others:

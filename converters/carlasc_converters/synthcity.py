@@ -12,7 +12,7 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -33,8 +33,8 @@ from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.geometry import translation
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, lines_of
-from carlasc.errors import ArgumentError, FormatError, MissingDataError, StorageError, import_extra
-from carlasc_converters.files import opening
+from carlasc.errors import ArgumentError, FormatError, StorageError, import_extra
+from carlasc_converters.files import no_data, opening
 
 # name, class of CarlaSC; the data count from 0, here 0 is unlabelled
 _CLASSES = [
@@ -76,15 +76,14 @@ _HEIGHT_M = (
     1.8  # height of the origin of a frame above its ground: about that of the LiDAR in CarlaSC
 )
 # around the middle of a tile, and least number of ground points there
-_GROUND_RADIUS_M, _GROUND_POINTS = (
-    5.0,
-    20,
-)
+_GROUND_RADIUS_M = 5.0
+_GROUND_POINTS = 20
 _BATCH = 1 << 18  # rows in memory
 # x and y from the middle of the tile
 _ROW = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f8"), ("label", "u1")])
 
 
+@dataclass(eq=False)
 class SynthCity(Converter):
     """Reads the areas of SynthCity, or one of them."""
 
@@ -95,21 +94,15 @@ class SynthCity(Converter):
     to_carla = Remap("synthcity_to_carla", CLASSES, CARLA, _TARGETS)
     sensor = "simulated mobile mapping (BlenSor)"
 
-    def __init__(
-        self,
-        source: Path,
-        *,
-        columns: Annotated[
-            str | None,
-            "Names of columns, if they are not found automatically: "
-            "x=X_noise,y=Y_noise,label=Class.",
-        ] = None,
-        grid: Annotated[
-            Literal["coarse", "fine"], "Published grid with the size and voxels of tiles."
-        ] = "coarse",
-    ) -> None:
-        super().__init__(source)
-        self.columns, self.grid = columns, grid
+    source: Path
+    _: KW_ONLY
+    columns: Annotated[
+        str | None,
+        "Names of columns, if they are not found automatically: x=X_noise,y=Y_noise,label=Class.",
+    ] = None
+    grid: Annotated[
+        Literal["coarse", "fine"], "Published grid with the size and voxels of tiles."
+    ] = "coarse"
 
     def sequences(self) -> list[Recording]:
         """Return the areas, by name.
@@ -124,9 +117,7 @@ class SynthCity(Converter):
         files = [self.source] if self.source.is_file() else sorted(self.source.rglob("*.parquet"))
         if not files:
             advice = "give their folder, or one of the tables"
-            raise MissingDataError(
-                self.source, expected="Parquet tables, one per area", found="none", advice=advice
-            )
+            raise no_data(self.source, "Parquet tables, one per area", advice)
         return [
             SynthCityArea(path, _find_columns(path, named), GridSpec.published(self.grid))
             for path in files
@@ -153,7 +144,9 @@ class SynthCityArea(Recording):
     sensors = (Sensor("assumed", height_m=_HEIGHT_M),)
 
     def __init__(self, path: Path, columns: Mapping[str, str], voxels: GridSpec) -> None:
-        self.path, self.location, self.columns = path, str(path), columns
+        self.path = path
+        self.location = str(path)
+        self.columns = columns
         self.voxels = self._spec = voxels
         self.name = f"SYNTHCITY_{path.stem.replace('_', '-')}"
 
@@ -180,7 +173,8 @@ class SynthCityArea(Recording):
 
         One pass over the table makes them.
         """
-        folder, tiles = _TileFolder(), set[tuple[int, int]]()
+        folder = _TileFolder()
+        tiles = set[tuple[int, int]]()
         for points, labels in _batches(self.path, self.columns):
             tiles |= _append(folder.name, points, labels, self._step)
         if not tiles:
@@ -254,7 +248,9 @@ class SynthCityFrame(FrameHandle):
         """Read the points of the tile, at all heights."""
         rows = np.fromfile(self.rows, _ROW)
         points = np.zeros((len(rows), 4), np.float32)
-        points[:, 0], points[:, 1], points[:, 2] = rows["x"], rows["y"], rows["z"] - self.height_m
+        points[:, 0] = rows["x"]
+        points[:, 1] = rows["y"]
+        points[:, 2] = rows["z"] - self.height_m
         return (Cloud(points, rows["label"]),)
 
     def read_voxels(self) -> VoxelContent:
@@ -264,7 +260,8 @@ class SynthCityFrame(FrameHandle):
         (cloud,) = self.read()
         assert cloud.labels is not None
         cells = self.spec.flat_index(cloud.points[:, :3])
-        inside, kinds = cells >= 0, len(CLASSES.names)
+        inside = cells >= 0
+        kinds = len(CLASSES.names)
         votes = np.bincount(
             cells[inside] * kinds + cloud.labels[inside], minlength=self.spec.num_voxels * kinds
         )
@@ -327,7 +324,8 @@ def _batches(path: Path, columns: Mapping[str, str]) -> Iterator[tuple[FloatArra
                 row = done + int(np.argmax(wrong))
                 raise FormatError(path, expected="finite coordinates", found=f"others in row {row}")
             if (wrong := ~np.isin(labels, np.arange(len(CLASSES.names) - 1))).any():
-                value, count = labels[np.argmax(wrong)], int(wrong.sum())
+                value = labels[np.argmax(wrong)]
+                count = int(wrong.sum())
                 raise FormatError(
                     path,
                     expected=f"labels 0 to {len(CLASSES.names) - 2} in the column "
@@ -359,13 +357,15 @@ def _append(
     tiles = np.floor(points[:, :2] / step).astype(np.int64)
     rows = np.empty(len(points), _ROW)
     rows["x"], rows["y"] = (points[:, :2] - (tiles + 0.5) * step).T
-    rows["z"], rows["label"] = points[:, 2], labels
+    rows["z"] = points[:, 2]
+    rows["label"] = labels
     low = tiles.min(axis=0)
     codes = (tiles[:, 0] - low[0]) * (np.ptp(tiles[:, 1]) + 1) + (tiles[:, 1] - low[1])
     # 16 bits, in nearly all cases, are sorted ten times as fast as 64
     codes = codes.astype(np.min_scalar_type(codes.max()))
     order = np.argsort(codes, kind="stable")
-    rows, codes = rows[order], codes[order]
+    rows = rows[order]
+    codes = codes[order]
     starts = np.append(0, np.flatnonzero(np.diff(codes)) + 1)
     squares = [(int(x), int(y)) for x, y in tiles[order[starts]]]
     try:

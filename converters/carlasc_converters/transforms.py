@@ -76,7 +76,9 @@ class FrameTrack:
     """The poses of one frame in another over time."""
 
     def __init__(self, where: str) -> None:
-        self._where, self._stamps, self._poses = where, array("q"), array("d")
+        self._where = where
+        self._stamps = array("q")
+        self._poses = array("d")
 
     def add(self, placed: PlacedFrame) -> None:
         """Add a time."""
@@ -93,10 +95,8 @@ class FrameTrack:
         Raises:
             FormatError: a quaternion is not a rotation.
         """
-        stamps, numbers = (
-            np.array(self._stamps, np.int64),
-            np.array(self._poses, np.float64).reshape(-1, 7),
-        )
+        stamps = np.array(self._stamps, np.int64)
+        numbers = np.array(self._poses, np.float64).reshape(-1, 7)
         poses = poses_of(numbers[:, 3:], numbers[:, :3], self._where)
         times, last = np.unique(stamps[::-1], return_index=True)
         return times, poses[::-1][last]
@@ -180,7 +180,8 @@ class FrameTree:
         """Return (M, 4, 4) target_T_source at some times, of two frames that are connected."""
         above = self.ancestors(target)
         common = next(frame for frame in self.ancestors(source) if frame in above)
-        up, down = self._climb(source, common, stamps), self._climb(target, common, stamps)
+        up = self._climb(source, common, stamps)
+        down = self._climb(target, common, stamps)
         return (
             up
             if target == common

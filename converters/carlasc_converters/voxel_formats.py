@@ -7,8 +7,9 @@ description of its benchmark or from the program that reads it: docs/commands/ev
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -76,11 +77,13 @@ def occ3d_mask(file: Path, seen_by: SeenBy) -> BoolArray | None:
         return arrays.read(name, ArrayFormat(WHOLE_NUMBERS, OCC3D_SPEC.size)).astype(np.bool_)
 
 
-def _is_occ3d(file: Path) -> bool:
+def _can(read: Callable[[Path], AnyArray], file: Path) -> bool:
+    """Whether a file can be read."""
     try:
-        return read_occ3d(file).size > 0
+        read(file)
     except (FormatError, MissingDataError):
         return False
+    return True
 
 
 def _rows(file: Path, columns: tuple[int, ...]) -> AnyArray:
@@ -145,22 +148,10 @@ def read_preprocessed(file: Path) -> LabelArray:
     return _checked(read_npy(file, ArrayFormat(NUMBERS, KITTI_SPEC.size)), file)
 
 
-class _Columns:
-    """Whether a file is an .npy with a number of columns. It pickles into workers."""
-
-    def __init__(self, number: int) -> None:
-        self.number = number
-
-    def __call__(self, file: Path) -> bool:
-        try:
-            return len(_rows(file, (self.number,))) >= 0
-        except (FormatError, MissingDataError):
-            return False
-
-
 def kitti_poses(folder: Path, names: list[str]) -> FloatArray | None:
     """Return (F, 4, 4) poses of the LiDAR from the poses.txt and calib.txt above the voxels."""
-    poses, calibration = folder.parent / "poses.txt", folder.parent / "calib.txt"
+    poses = folder.parent / "poses.txt"
+    calibration = folder.parent / "calib.txt"
     if not (poses.is_file() and calibration.is_file()):
         return None
     with reading(poses, "a pose of 12 numbers for each scan, and Tr in calib.txt"):
@@ -204,7 +195,8 @@ class CarlaScPredictions(VoxelFormat):
             for path, names in matches(place, template):
                 found.setdefault(path.parent, {})[names["frame"]] = path
             for folder, files in sorted(found.items()):
-                coordinates, scans = folder.parent.name, layout.scan_folders()
+                coordinates = folder.parent.name
+                scans = layout.scan_folders()
                 if coordinates not in layout.COORDINATES or folder.name in scans:
                     continue
                 for preset in ("coarse", "fine", "cylindrical"):
@@ -283,7 +275,10 @@ OCC3D_BELOW = replace(
     OCC3D_FILES, files={name: f"gts/{template}" for name, template in OCC3D_FILES.files.items()}
 )
 OCC3D_PREDICTIONS = replace(
-    OCC3D_FILES, name="Occ3D predictions", files={"pred": "{frame}.npz"}, holds=_is_occ3d
+    OCC3D_FILES,
+    name="Occ3D predictions",
+    files={"pred": "{frame}.npz"},
+    holds=partial(_can, read_occ3d),
 )
 OPENOCCUPANCY_FILES = VoxelFormat(
     "OpenOccupancy",
@@ -301,7 +296,7 @@ SURROUNDOCC_FILES = VoxelFormat(
     OPENOCCUPANCY,
     SURROUNDOCC_SPEC,
     read_surroundocc,
-    holds=_Columns(4),
+    holds=partial(_can, partial(_rows, columns=(4,))),
     benchmark=("surroundocc",),
     place=_LIDAR,
     y_forward=True,
@@ -311,6 +306,6 @@ OCCNET_FILES = replace(
     name="OccNet",
     classes=OCCNET,
     read=read_occnet,
-    holds=_Columns(2),
+    holds=partial(_can, partial(_rows, columns=(2,))),
     benchmark=("occnet",),
 )

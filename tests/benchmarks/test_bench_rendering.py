@@ -11,7 +11,7 @@ from carlasc import Run
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.storage.folder import FolderSink
-from carlasc.viewing import Scene, render, render_grid, render_scan
+from carlasc.viewing import Look, Scene, render, render_grid, render_scan
 
 pytestmark = pytest.mark.slow
 
@@ -31,7 +31,7 @@ def street(spec):
 @pytest.mark.parametrize("name", ["coarse", "fine", "cylindrical"])
 def test_bench_full_grid(benchmark, name, view):
     grid = street(GridSpec.published(name))
-    benchmark.pedantic(render_grid, (grid,), {"view": view}, rounds=5, warmup_rounds=1)
+    benchmark.pedantic(render_grid, (grid,), {"look": Look(view=view)}, rounds=5, warmup_rounds=1)
 
 
 @pytest.mark.benchmark(group="rendering")

@@ -33,9 +33,9 @@ def test_bench_a_command(benchmark, tmp_path, command):
 
 _FIRST_USES = {
     "pictures": "from carlasc.core.grids import Grid, GridSpec; from carlasc.viewing import "
-    "render_grid\n"
+    "Look, render_grid\n"
     "spec = GridSpec.published(); render_grid(Grid(spec, np.ones(spec.size, np.uint8)), "
-    "size=(128, 72))",
+    "look=Look(size=(128, 72)))",
     "scores": "from carlasc.metrics.confusion import count_arrays\n"
     "count_arrays(np.zeros(9, np.uint8), np.zeros(9, np.uint8), None, 3)",
 }

@@ -304,10 +304,17 @@ def test_info_and_validate_name_grids_that_are_stale(made, change):
 
 
 @pytest.mark.slow
-def test_scans_beside_grids_elsewhere_are_replaced(drive, tmp_path):
+@pytest.mark.parametrize("kills", [0, 1, 2])
+def test_scans_beside_grids_elsewhere_are_replaced(drive, tmp_path, monkeypatch, kills):
     source, out = copy(drive, tmp_path / "data"), tmp_path / "out"
     regrid(source, SPEC, out, observe=STILL, run=ALONE)
+    for path in scans(out).glob("evaluation*/*.label") if kills else ():
+        path.unlink()  # a killed run had written the scans only
     change_labels(source, np.random.default_rng(0))
+    if kills > 1:
+        with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
+            killed.setattr("carlasc.groundtruth.run.run_all", interrupt)
+            regrid(source, SPEC, out, observe=STILL, run=ALONE)
     regrid(source, SPEC, out, observe=STILL, run=ALONE)
     regrid(source, SPEC, tmp_path / "fresh", observe=STILL, run=ALONE)
     assert outputs(out) == outputs(tmp_path / "fresh")
@@ -375,7 +382,7 @@ def test_a_capture_without_its_last_frame(tmp_path):
     assert outputs(tmp_path / "out") == outputs(tmp_path / "fresh")
 
 
-def interrupt(*_: object) -> None:
+def interrupt(*_: object, **__: object) -> None:
     raise KeyboardInterrupt
 
 

@@ -245,7 +245,7 @@ def test_what_is_no_report_is_refused(made, change, message):
 def test_a_grid_without_counts_has_no_votes():
     labels = np.zeros(SPEC.size, np.uint32)
     labels[0, 0, 0] = 10
-    facts = FrameFacts.of(0, {"g/labels": labels}, "g", SPEC, CARLA)
+    facts = FrameFacts.of(0, {"g/labels": labels}, "g", CARLA)
     coverage = Report.make("g", [facts], SPEC.to_params(), CARLA, {}).coverage
     assert coverage.known_share == 1
     assert (coverage.mean_votes, coverage.votes) == (None, ())
@@ -254,7 +254,7 @@ def test_a_grid_without_counts_has_no_votes():
 
 def test_the_inferred_share_needs_every_frame_to_say_it():
     labels = np.ones(SPEC.size, np.uint32)
-    facts = [FrameFacts.of(frame, {"g/labels": labels}, "g", SPEC, CARLA) for frame in (0, 1)]
+    facts = [FrameFacts.of(frame, {"g/labels": labels}, "g", CARLA) for frame in (0, 1)]
     told = [replace(row, inferred=SPEC.num_voxels // 4) for row in facts]
     assert Report.make("g", told, SPEC.to_params(), CARLA, {}).inferred_share == 0.25
     assert Report.make("g", [told[0], facts[1]], SPEC.to_params(), CARLA, {}).inferred_share is None

@@ -331,13 +331,13 @@ def test_a_mistake_in_poses_is_reported_if_it_explains_three_quarters_of_the_pai
 
 def test_pairs_are_two_metres_apart_or_ten_frames():
     assert all(
-        later - earlier == 4 for earlier, later in choose_pairs(straight(30, 0.5), 8) if later < 29
+        later - earlier == 4 for earlier, later in choose_pairs(straight(30, 0.5)) if later < 29
     )
     assert all(
-        later - earlier == 10 for earlier, later in choose_pairs(straight(40, 0.1), 8) if later < 39
+        later - earlier == 10 for earlier, later in choose_pairs(straight(40, 0.1)) if later < 39
     )
     assert {
-        later - earlier for earlier, later in choose_pairs(straight(40, 0.0), 8) if later < 39
+        later - earlier for earlier, later in choose_pairs(straight(40, 0.0)) if later < 39
     } == {1, 4}
-    assert choose_pairs(straight(1, 1.0), 8) == []
-    assert len(choose_pairs(straight(60, 0.5), 8)) == 8
+    assert choose_pairs(straight(1, 1.0)) == []
+    assert len(choose_pairs(straight(60, 0.5))) == 24

@@ -68,7 +68,7 @@ def test_each_scan_is_read_once():
         return world - poses[index, :3, 3]
 
     assert diagnose_poses(structure, poses, points=lambda index: np.empty((0, 3))).share > 0.5
-    assert reads == Counter(set(np.ravel(choose_pairs(poses, 24)).tolist()))
+    assert reads == Counter(set(np.ravel(choose_pairs(poses)).tolist()))
 
 
 BUILDING, ROAD, VEHICLE = 1, 7, 10

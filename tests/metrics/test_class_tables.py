@@ -242,7 +242,7 @@ def test_tables_for_papers_have_the_same_figures(town, tmp_path):
     assert markdown[2].startswith("| Network |") and markdown[4].startswith("| A\\|B | 100.00 |")
     (tmp_path / "a.json").write_text(json.dumps(result.to_dict()))
     table = scores([tmp_path / "a.json"])
-    assert table.to_csv().splitlines()[1].startswith("A|B,100.00")
+    assert table.table().to_csv().splitlines()[1].startswith("A|B,100.00")
 
 
 def test_only_named_sequences_are_scored_and_those_without_truth_are_listed(town, tmp_path):

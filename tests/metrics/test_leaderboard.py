@@ -34,11 +34,11 @@ def run(*arguments):
 def test_results_stand_side_by_side_in_every_format(files):
     table = scores(files)
     assert table.convention == "carlasc"
-    markdown = table.to_markdown().splitlines()
+    markdown = table.table().to_markdown().splitlines()
     assert markdown[2] == "| Network | Road | Car | mIoU | IoU | Precision | Recall | False free |"
     assert markdown[4] == "| Net_1 | 70.00 | 25.00 | 40.00 | 80.00 | 90.00 | - | 10.00 |"
     assert markdown[5].split(" | ")[2] == "-"
-    assert r"Net\_1 & 70.00 & 25.00" in table.to_latex()
+    assert r"Net\_1 & 70.00 & 25.00" in table.table().to_latex()
 
 
 def test_the_page_has_a_bar_per_class_escapes_names_and_asks_no_other_host(files):

@@ -174,19 +174,6 @@ def test_classes_may_be_numbered_in_any_way():
     assert turned.rayiou == pytest.approx(plain.rayiou)
 
 
-def test_rays_that_cross_unknown_voxels_can_be_dropped():
-    wall = np.zeros(SPEC.size, np.uint8)
-    wall[14] = 2
-    known = np.ones(SPEC.size, bool)
-    known[13, :6] = False
-    origins = [[0.0, 0.05, 0.5]]
-    everything = RayIoU(K).update(wall, wall, SPEC, origins)
-    some = RayIoU(K, skip_unknown=True).update(wall, wall, SPEC, origins, known)
-    assert 0 < some.true[2] < everything.true[2]
-    with pytest.raises(ArgumentError, match="known"):
-        RayIoU(K, skip_unknown=True).update(wall, wall, SPEC, origins)
-
-
 def test_origins_are_places_on_the_way_inside_the_grid_at_most_eight_evenly():
     poses = np.tile(np.eye(4), (41, 1, 1))
     poses[:, 0, 3] = np.arange(41) * 0.5

@@ -13,7 +13,6 @@ from carlasc.metrics import (
     distance_bands,
     field_of_view,
     height_bands,
-    known,
     motion,
     visibility,
 )
@@ -154,7 +153,3 @@ def test_masks_that_can_hold_nothing_are_refused():
             field_of_view(SMALL, angle)
     with pytest.raises(ArgumentError, match="vertical_rad"):
         field_of_view(SMALL, vertical_rad=(0.1, 0.1))
-
-
-def test_known_is_a_count_above_zero():
-    np.testing.assert_array_equal(known(np.array([0.0, 1.0, 7.0])), [False, True, True])

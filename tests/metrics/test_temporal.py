@@ -1,14 +1,12 @@
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
 from carlasc import Grid, GridSpec
 from carlasc.core import translation
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.metrics import Consistency, moved_grid, shape_consistency
+from carlasc.metrics import Consistency, moved_grid
 
 SPEC = GridSpec("cartesian", (10, 8, 2), (-5.0, -4.0, -1.0), (5.0, 4.0, 1.0))
 
@@ -60,13 +58,3 @@ def test_grids_of_other_geometry_are_refused():
         Consistency(4, moving=()).update(
             grid(0), Grid(other, np.zeros(other.size, np.uint8)), np.eye(4)
         )
-
-
-def test_shapes_are_compared_as_sets_of_voxels():
-    one = np.zeros((3, 3, 3), bool)
-    one[0] = True
-    assert shape_consistency(one, one) == 1.0
-    assert shape_consistency(one, np.roll(one, 1, 0)) == 0.0
-    both = one | np.roll(one, 1, 0)
-    assert shape_consistency(one, both) == 0.5
-    assert math.isnan(shape_consistency(one & False, one & False))

@@ -124,7 +124,8 @@ def _write_rows(file: BinaryIO, points: PointPieces, head: list[str]) -> None:
 def _write_las(file: BinaryIO, points: PointPieces) -> None:
     laspy = import_extra("laspy", "scans")
     header = laspy.LasHeader(version="1.4", point_format=7)
-    header.scales, header.offsets = np.full(3, _LAS_SCALE_M), np.zeros(3)
+    header.scales = np.full(3, _LAS_SCALE_M)
+    header.offsets = np.zeros(3)
     extra = {"label": np.uint16, "seen": np.uint32, "confidence": np.float32}
     header.add_extra_dims([laspy.ExtraBytesParams(name, kind) for name, kind in extra.items()])
     with laspy.open(file, mode="w", header=header, closefd=False) as writer:
@@ -145,10 +146,8 @@ def _write_npz(file: BinaryIO, points: PointPieces) -> None:
     with zipfile.ZipFile(file, "w") as archive:
         for name in ("points", "label", "seen", "confidence"):
             is_place = name == "points"
-            dtype, columns = (
-                POINT_DTYPE["x" if is_place else name],
-                ["x", "y", "z"] if is_place else [name],
-            )
+            dtype = POINT_DTYPE["x" if is_place else name]
+            columns = ["x", "y", "z"] if is_place else [name]
             header = {
                 "descr": dtype.str,
                 "fortran_order": False,
@@ -158,7 +157,8 @@ def _write_npz(file: BinaryIO, points: PointPieces) -> None:
                 np.lib.format.write_array_header_2_0(entry, header)
                 for piece in points.pieces():
                     entry.write(structured_to_unstructured(piece[columns], dtype).tobytes())
-        table, names = sorted(points.classes.names.items()), io.BytesIO()
+        table = sorted(points.classes.names.items())
+        names = io.BytesIO()
         np.save(names, np.array(table, [("label", "<u2"), ("name", "<U64")]))
         archive.writestr(zipfile.ZipInfo("classes.npy"), names.getvalue())
 
@@ -175,8 +175,12 @@ POINT_ENDINGS = tuple(_WRITERS)
 
 _LEVELS = 16
 _MIDDLE = 1 << (_LEVELS - 1)
-_FREE, _OCCUPIED, _INNER = 1, 2, 3
-_ALL_FREE, _ALL_OCCUPIED = 0x5555, 0xAAAA  # eight equal children, which become one leaf
+_FREE = 1
+_OCCUPIED = 2
+_INNER = 3
+# eight equal children, which become one leaf
+_ALL_FREE = 0x5555
+_ALL_OCCUPIED = 0xAAAA
 
 
 def write_octomap(
@@ -217,7 +221,9 @@ def _encode(cells: AnyIntArray, occupied: BoolArray) -> tuple[int, bytes]:
     order = np.argsort(code)
     code = code[order]
     state = np.where(occupied[order], _OCCUPIED, _FREE).astype(np.uint16)
-    nodes, first, inner = 1, [np.empty(0, np.uint64)], [np.empty(0, np.uint16)]
+    nodes = 1
+    first = [np.empty(0, np.uint64)]
+    inner = [np.empty(0, np.uint16)]
     depths = [np.empty(0, np.int8)]
     for depth in range(_LEVELS - 1, -1, -1):  # of the parents of these nodes
         starts = np.flatnonzero(np.diff(code >> np.uint64(3), prepend=np.uint64(1 << 63)))

@@ -40,15 +40,21 @@ ROW_DTYPE = np.dtype(
 in the cell, in 1 / `_STEPS` of it.
 """
 
-_SIDE_BITS, _HEIGHT_BITS, _LABEL_BITS = 9, 24, 16  # of a key: x and y in the tile, z, and the class
-_SIDE, _MIDDLE = 1 << _SIDE_BITS, 1 << (_HEIGHT_BITS - 1)
-_STEPS, _VOTE = 1024, 65535
+# of a key: x and y in the tile, z, and the class
+_SIDE_BITS = 9
+_HEIGHT_BITS = 24
+_LABEL_BITS = 16
+_SIDE = 1 << _SIDE_BITS
+_MIDDLE = 1 << (_HEIGHT_BITS - 1)
+_STEPS = 1024
+_VOTE = 65535
 # least distance of points from the faces of a cell, so that float32 rounding keeps them inside
 _EDGE = 1 / 64
 _MOST_ROWS = 1_000_000  # in memory: 48 MB
 _REPEATED = 2  # rows of a part on disk, over those that are left when they are summed
 # What is so far above the lowest static point of a column, of this width, is no ground.
-_ABOVE_M, _COLUMN_M = 0.06, 0.25
+_ABOVE_M = 0.06
+_COLUMN_M = 0.25
 
 
 def rows_of_scan(
@@ -79,7 +85,8 @@ def rows_of_scan(
     changed = np.append(True, np.diff(cells[order], axis=0).any(axis=1))
     begins = np.flatnonzero(changed)
     rows = np.zeros(len(begins), ROW_DTYPE)
-    rows["seen"], rows["points"] = 1, np.diff(np.append(begins, len(order)))
+    rows["seen"] = 1
+    rows["points"] = np.diff(np.append(begins, len(order)))
     for axis, name in enumerate("xyz"):
         rows[name] = np.add.reduceat(places[order, axis], begins)
 
@@ -87,10 +94,8 @@ def rows_of_scan(
     # classes.
     sorted_labels = labels[order].astype(np.int64)
     runs = np.flatnonzero(changed | np.append(True, np.diff(sorted_labels) != 0))
-    lengths, cell_of = (
-        np.diff(np.append(runs, len(order))),
-        np.searchsorted(begins, runs, side="right") - 1,
-    )
+    lengths = np.diff(np.append(runs, len(order)))
+    cell_of = np.searchsorted(begins, runs, side="right") - 1
     best = np.lexsort((sorted_labels[runs], -lengths, cell_of))
     best = best[run_starts(cell_of[best])]
     certain = np.ones(len(order)) if sure is None else sure[order].astype(np.float64)
@@ -110,7 +115,8 @@ def rows_of_scan(
 def split(parts: IntArray, rows: AnyArray) -> list[tuple[Part, AnyArray]]:
     """Return the rows of each part, in order; rows of the same cell and class are summed."""
     order = np.lexsort((rows["key"], *parts.T[::-1]))
-    parts, rows = parts[order], rows[order]
+    parts = parts[order]
+    rows = rows[order]
     begins = np.flatnonzero(
         (np.diff(parts, axis=0, prepend=np.iinfo(np.int64).min) != 0).any(axis=1)
     )
@@ -140,7 +146,9 @@ class GrowingCells:
     """
 
     def __init__(self, folder: Path, cell_m: float, most_rows: int = _MOST_ROWS) -> None:
-        self.folder, self.cell_m, self.most_rows = folder, cell_m, most_rows
+        self.folder = folder
+        self.cell_m = cell_m
+        self.most_rows = most_rows
         self.counts: dict[Part, int] = {}
         self._rows: OrderedDict[Part, list[AnyArray]] = OrderedDict()
         self._held = 0
@@ -167,7 +175,9 @@ class GrowingCells:
         stored, most = self._stored.get(part, (0, _REPEATED * len(rows)))
         mode = "ab"
         if stored + len(rows) > most:
-            rows, stored, mode = self._whole(part, [rows]), 0, "wb"
+            rows = self._whole(part, [rows])
+            stored = 0
+            mode = "wb"
             most = _REPEATED * len(rows)
         with self._path(part).open(mode) as file:
             rows.tofile(file)
@@ -221,10 +231,8 @@ class GrowingCells:
         begins = run_starts(cells)
         best = np.lexsort((rows["key"], -rows["votes"], cells))
         best = best[run_starts(cells[best])]
-        points, count = (
-            np.zeros(len(begins), POINT_DTYPE),
-            np.add.reduceat(rows["points"].astype(np.int64), begins),
-        )
+        points = np.zeros(len(begins), POINT_DTYPE)
+        count = np.add.reduceat(rows["points"].astype(np.int64), begins)
         for name, index in zip("xyz", _indices(part, cells[begins]).T, strict=True):
             inside = (np.add.reduceat(rows[name], begins) / count + 0.5) / _STEPS
             points[name] = (index + np.clip(inside, _EDGE, 1 - _EDGE)) * self.cell_m
@@ -243,7 +251,8 @@ class GrowingCells:
 def _indices(part: Part, cells: IntArray) -> IntArray:
     """Return the (N, 3) indices of cells of a part, from keys without their class."""
     column = cells >> _HEIGHT_BITS
-    x, y = column >> _SIDE_BITS, column & (_SIDE - 1)
+    x = column >> _SIDE_BITS
+    y = column & (_SIDE - 1)
     z = (cells & (2 * _MIDDLE - 1)) - _MIDDLE
     return np.stack([x + part[1] * _SIDE, y + part[2] * _SIDE, z], axis=1)
 

@@ -216,7 +216,8 @@ class SurfaceMesh:
         """
         nodes = [np.empty((0, 3), np.int64)]
         faces = [np.empty((0, 3), np.int64)]
-        classes, count = [np.empty(0, np.int64)], 0
+        classes = [np.empty(0, np.int64)]
+        count = 0
         occupied = known.labels > 0
         for corner, volume in _blocks(known.index[occupied], known.labels[occupied]):
             vertices, triangles, own = _march(volume)
@@ -310,7 +311,8 @@ def write_distances(path: AnyPath, grid: Grid) -> None:
         StorageError: the file cannot be written; an earlier one stays.
     """
     transform = import_extra("scipy.ndimage", "mesh").distance_transform_edt
-    spec, buffer = grid.spec, io.BytesIO()
+    spec = grid.spec
+    buffer = io.BytesIO()
     occupied = grid.known & (grid.labels > 0)
     size = spec.voxel_size.astype(np.float64)
     if occupied.all() or not occupied.any():

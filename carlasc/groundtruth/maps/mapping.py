@@ -88,7 +88,8 @@ def write_map(
     with temporary_folder(files.all[0]) as folder:  # of cells that do not fit into memory
         drive = DriveMap.of(source, frames, options, GrowingCells(folder, cell_m))
         drive.fill(writer, run, files.actors is not None, keep_parked)
-        points, bodies = drive.write(files), 0
+        points = drive.write(files)
+        bodies = 0
         if files.trajectory is not None:
             drive.write_trajectory(files.trajectory)
         if files.boxes is not None:
@@ -163,14 +164,16 @@ class DriveMap:
 
     def _find_gone(self, pool: Run, progress: StepCounter) -> tuple[IntArray, int]:
         """Return the cells of parked actors that are gone in another pass, and their number."""
-        feed, frames = self.inputs.feed, np.array(self.frames)
+        feed = self.inputs.feed
+        frames = np.array(self.frames)
         positions = np.stack([feed.pose(frame)[:3, 3] for frame in self.frames])
         seconds = np.array([feed.time(frame) for frame in self.frames])
         passes = {
             self.frames[row]: [frames[rows].tolist() for rows in others]
             for row, others in other_passes(positions, seconds).items()
         }
-        blocks, near = _blocks(list(passes)), self.inputs.actors.between
+        blocks = _blocks(list(passes))
+        near = self.inputs.actors.between
         progress.expect(len(passes))
         items = (({one: passes[one] for one in own}, near(own[0], own[-1])) for own in blocks)
         found = np.empty(0, np.int64), np.empty((0, 3), np.int32)
@@ -310,7 +313,8 @@ class _AddScans:
         """Yield the cells of the static points of a scan, then, if `actors` is set, those of each
         actor.
         """
-        feed, scan = self.feed, self.feed.read(frame)
+        feed = self.feed
+        scan = self.feed.read(frame)
         labels = merger.labels(frame)
         static = merger.static(frame)
         under = merger.under(frame)
@@ -328,7 +332,8 @@ class _AddScans:
             for group, own in ((STATIC, static & ~under), (UNDER, static & under))
         ]
         for number, track in merger.actors.tracks.items() if self.actors else ():
-            members, pose = track.members.get(frame), track.pose(frame)
+            members = track.members.get(frame)
+            pose = track.pose(frame)
             if members is not None and pose is not None:
                 own = settled[members].astype(np.float64)
                 actor_T_sensor = invert(pose) @ scan.world_T_sensor
@@ -367,7 +372,8 @@ def write_grid(source: Source, name: str, frames: FrameRange, files: MapFiles) -
     grid = mirror_voxels(given) if sequence.metadata.axes == "left" else given
     lower = np.array(grid.spec.lower)
     size = grid.spec.voxel_size.astype(np.float64)
-    index, labels = np.argwhere(grid.known), grid.labels[grid.known]
+    index = np.argwhere(grid.known)
+    labels = grid.labels[grid.known]
     occupied = grid.known & (grid.labels > 0)
     if not occupied.any():
         raise MissingDataError(where, expected="occupied voxels", found="none")
@@ -389,7 +395,8 @@ def write_grid(source: Source, name: str, frames: FrameRange, files: MapFiles) -
 def with_neighbours(frames: FrameRange) -> FrameRange:
     """Return a range with the frames around it that tell what moves in it."""
     around = round(HORIZON_S / layout.FRAME_PERIOD_S)
-    start, stop = frames.start, frames.stop
+    start = frames.start
+    stop = frames.stop
     return FrameRange(
         None if start is None else max(start - around, 0), None if stop is None else stop + around
     )

@@ -55,13 +55,17 @@ from carlasc.storage.resuming import derived_key, read_derived
 from carlasc.storage.shares import Share, source_in
 
 _VERSION = 2  # version of the counts: it changes when the same input gives other sums
-_STRETCH, _STRETCHES = 8, 10  # frames of a stretch, and least number of stretches of a sequence
+# frames of a stretch, and least number of stretches of a sequence
+_STRETCH = 8
+_STRETCHES = 10
 _DRAWN = 50  # largest number of stretches to draw from: with more, neighbours are drawn together
 _SHOWN = 4  # number of frames in pictures
 _REACH = 30  # frames before and after a stretch in which actors matter
 _BLOCK = 400  # frames for which actors are found together
 # name of the files of sums, and of other entries in them
-_SUMS, _WORST, _KEY = ("audit", "worst", "key")
+_SUMS = "audit"
+_WORST = "worst"
+_KEY = "key"
 _PARTS = f"{layout.DERIVED}/parts"  # folder with a file of each finished part
 
 # a wrong frame: path, frame of the grid, frame of the scan, wrong voxels
@@ -82,7 +86,8 @@ class _Stretch:
     @cached_property
     def key(self) -> str:
         """The name of the sums, which differs for other grids, other scans or another window."""
-        one, content = self.matched, sha256()
+        one = self.matched
+        content = sha256()
         for number, _ in self.frames:
             # an error is reported when the frame is counted
             for part in tried_twice(partial(one.read, number)) or ():
@@ -101,7 +106,9 @@ class _Stretch:
         if (kept := self.read()) is not None:
             return kept, []
         counter = FrameCounter(self.matched, self.actors, self.window)
-        sums, worst, failures = Sums(), [], []
+        sums = Sums()
+        worst = []
+        failures = []
         for number, frame in self.frames:
             try:
                 kinds = counter.add_frame(sums, number, frame)
@@ -111,7 +118,8 @@ class _Stretch:
                 worst.append((number, frame, np.count_nonzero(kinds > OCCUPIED)))
         sums[_WORST] = np.array(worst, np.int64).reshape(-1, 3)
         if self.writer is not None and not failures:
-            buffer, entries = io.BytesIO(), {_KEY: np.array(self.key), **sums}
+            buffer = io.BytesIO()
+            entries = {_KEY: np.array(self.key), **sums}
             np.savez_compressed(buffer, **entries)  # type: ignore[arg-type]
             self.writer.write_document(layout.derived(_SUMS, self.key), buffer.getvalue())
         return sums, failures
@@ -177,7 +185,8 @@ def audit(
             "part", expected="`keep`, a folder in which parts are joined", found="no folder"
         )
     places = tuple(one.location if isinstance(one, Source) else str(one) for one in (grids, scans))
-    share, matched = Share(as_source(scans), run), list[MatchedGrids]()
+    share = Share(as_source(scans), run)
+    matched = list[MatchedGrids]()
     try:
         matched += match_grids(_grids_of(grids, share), share, grid, frames)
     except MissingDataError:
@@ -243,7 +252,9 @@ def _stretches_of(
     one: MatchedGrids, window: tuple[int, int] | None, keep: str | Path | None
 ) -> Iterator[_Stretch]:
     """Yield the stretches of a sequence, without actors."""
-    writer, digest, scans = None, "", one.scans.frames("points")
+    writer = None
+    digest = ""
+    scans = one.scans.frames("points")
     if keep is not None:
         writer = FolderSink(keep).sequence(one.path)
         digests = content_digests(SequenceFiles(one.scans), scans.tolist(), writer)
@@ -267,7 +278,8 @@ def _with_actors(stretches: Iterable[_Stretch], run: Run, notes: list[str]) -> I
             if stretch.read() is not None:
                 yield stretch
                 continue
-            first, last = stretch.frames[0][1], stretch.frames[-1][1]
+            first = stretch.frames[0][1]
+            last = stretch.frames[-1][1]
             if actors is None:
                 end = (block + 1) * _BLOCK + last - first
                 actors = _actors_of(stretch.matched, block * _BLOCK, end, run, notes)
@@ -306,11 +318,14 @@ def _count_all(
     steps(0)
     lengths = Counter(stretch.matched.path for stretch in stretches)
     sums = {path: [Sums() for _ in range(min(length, _DRAWN))] for path, length in lengths.items()}
-    worst, failures, rows = list[_Row](), list[AuditFailure](), Counter[str]()
+    worst = list[_Row]()
+    failures = list[AuditFailure]()
+    rows = Counter[str]()
     tasks = _with_actors(stretches, run, notes)
     with closing(run_all(_Stretch.count, tasks, run, lost=_fail)) as results:
         for stretch, (counted, failed) in zip(stretches, results, strict=True):
-            counts, path = {**counted}, stretch.matched.path
+            counts = {**counted}
+            path = stretch.matched.path
             steps(len(stretch.frames))
             failures += failed
             rows_of = counts.pop(_WORST, np.empty((0, 3), np.int64)).tolist()

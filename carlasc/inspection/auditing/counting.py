@@ -36,9 +36,12 @@ from carlasc.motion.tracks import FIRST_FOUND, MovingActors, Track
 HEIGHTS = 4  # shares are also computed for this number of layers of equal height
 MAX_ID = 511  # larger ids of classes count as this one
 # points of a frame that are thinned evenly in space, and rays that are followed
-_SPREAD, _RAYS = (20_000, 8000)
+_SPREAD = 20_000
+_RAYS = 8000
 # points that are kept of these in a frame, and in all frames
-_LEAST, _MOST, _IN_ALL = (500, 2500, 250_000)
+_LEAST = 500
+_MOST = 2500
+_IN_ALL = 250_000
 # frames before and after, in which the paths of actors are checked
 _TIMES = (*range(-20, -1, 2), *range(2, 21, 2))
 _APART = 20  # frames between the scans that show a drift
@@ -126,9 +129,11 @@ class FrameCounter:
         return kinds
 
     def _read(self, number: int, frame: int) -> _Frame:
-        spec, scan = self.matched.spec, self._scan(frame)
+        spec = self.matched.spec
+        scan = self._scan(frame)
         labels, occupied, known = self.matched.read(number)
-        points, returns = self.matched.place(scan.points), _are_returns(scan)
+        points = self.matched.place(scan.points)
+        returns = _are_returns(scan)
         rays = np.flatnonzero(returns)
         rays = rays[:: max(1, len(rays) // _RAYS)]
         begun = scan.others.get("origins", np.zeros_like(scan.points))[rays]
@@ -172,7 +177,8 @@ class FrameCounter:
     def _fit(
         self, seen: _Frame, warps: FloatArray, points: FloatArray, later_s: float = 0.0
     ) -> IntArray:
-        spec, occupied = self.matched.spec, seen.occupied
+        spec = self.matched.spec
+        occupied = seen.occupied
         at_points = labels_at(points, spec, occupied, warps=warps, later_s=later_s)
         return np.column_stack([np.full(len(warps), len(points)), (at_points > 0).sum(axis=1)])
 
@@ -185,7 +191,8 @@ class FrameCounter:
         cannot be read.
         """
         if frame not in self._spread:
-            spec, scan = self.matched.spec, self._other(frame)
+            spec = self.matched.spec
+            scan = self._other(frame)
             edge = float(spec.voxel_size[[0, 2]].min()) / 2
             some = np.empty((0, 3), np.float32)
             if scan is not None:
@@ -211,7 +218,8 @@ class FrameCounter:
         """Return (N, 3) returns of another scan inside the grid of a frame, without classes that
         can move; None without the scan.
         """
-        grid_T_world, scan = self._grid_T_world(frame), self._other(other)
+        grid_T_world = self._grid_T_world(frame)
+        scan = self._other(other)
         if grid_T_world is None or scan is None:
             return None
         keep = _are_returns(scan)
@@ -236,7 +244,8 @@ class FrameCounter:
         """Count the classes of the grid, points by their class and the class of their voxel, and
         columns with ground at one and at two heights.
         """
-        lookup, labels = self.matched.lookup, seen.scan.labels
+        lookup = self.matched.lookup
+        labels = seen.scan.labels
         classes = np.bincount(seen.labels[seen.occupied], minlength=MAX_ID + 1)
         add(sums, "classes of grids", classes)
         if self.matched.ground:
@@ -270,7 +279,8 @@ class FrameCounter:
         """Count occupied voxels that rays see, and those that rays cross, by class, distance and
         height; return the crossed ones.
         """
-        spec, clear = self.matched.spec, seen.crossed >= _CLEAR_RAYS
+        spec = self.matched.spec
+        clear = seen.crossed >= _CLEAR_RAYS
         wrong = seen.occupied & clear & ~seen.around
         # rays near the ground cross its voxels for metres
         wrong &= ~(
@@ -294,7 +304,8 @@ class FrameCounter:
         wrong: BoolArray,
     ) -> None:
         """Add (K, B, H, 2) counts by class, distance and height: all, and the wrong ones."""
-        low, high = self.matched.spec.lower[2], self.matched.spec.upper[2]
+        low = self.matched.spec.lower[2]
+        high = self.matched.spec.upper[2]
         heights = ((points[:, 2] - low) / (high - low) * HEIGHTS).clip(0, HEIGHTS - 1).astype(int)
         bands = np.searchsorted(BANDS_M, np.linalg.norm(points, axis=1), side="right") - 1
         counts = np.zeros((MAX_ID + 1, len(BANDS_M) - 1, HEIGHTS, 2), np.int64)
@@ -312,7 +323,8 @@ class FrameCounter:
         angles = self._elevations(seen.points[seen.voxels >= 0])
         of_voxels = self._elevations_of_voxels
         view = (of_voxels >= angles.min()) & (of_voxels <= angles.max())
-        without, crossed = ~seen.known & ~seen.hit, seen.crossed > 0
+        without = ~seen.known & ~seen.hit
+        crossed = seen.crossed > 0
         rest = without & ~crossed
         causes = [~seen.known & seen.hit, without & crossed, rest & ~view, rest & view]
         add(sums, "unknown", [seen.known.size, *(cause.sum() for cause in causes)])
@@ -359,7 +371,8 @@ class FrameCounter:
 
     def _members(self, seen: _Frame) -> list[tuple[str, AnyIntArray]]:
         """Return the points of each actor in a scan, by instances or by tracks."""
-        ids, labels = seen.scan.instances, seen.scan.labels
+        ids = seen.scan.instances
+        labels = seen.scan.labels
         if ids is None or not ids.any():
             tracks = self.actors.tracks.items()
             return [
@@ -388,7 +401,8 @@ class FrameCounter:
         """
         spec = self.matched.spec
         poses = [pose for frame in frames if (pose := track.pose(frame)) is not None]
-        lower, upper = track.lower - margin_m, track.upper + margin_m
+        lower = track.lower - margin_m
+        upper = track.upper + margin_m
         if margin_m < 0:
             lower[2] = track.lower[2] + float(spec.voxel_size[2])
         if not poses or (upper <= lower).any():
@@ -441,13 +455,20 @@ def crossings(origins: FloatArray, points: FloatArray, spec: GridSpec, margin_m:
 def _cross(origins, points, cells, step_m, margin_m, crossed):  # type: ignore[no-untyped-def]
     outside = len(crossed) - 1
     for i in range(len(points)):
-        x, y, z = origins[i, 0], origins[i, 1], origins[i, 2]
-        dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
+        x = origins[i, 0]
+        y = origins[i, 1]
+        z = origins[i, 2]
+        dx = points[i, 0] - x
+        dy = points[i, 1] - y
+        dz = points[i, 2] - z
         length = np.sqrt(dx * dx + dy * dy + dz * dz)
         if not length > margin_m:
             continue
-        dx, dy, dz = dx / length, dy / length, dz / length
-        last, inside = outside, 0
+        dx = dx / length
+        dy = dy / length
+        dz = dz / length
+        last = outside
+        inside = 0
         for k in range(int((length - margin_m) / step_m)):
             t = (k + 0.5) * step_m
             voxel = find_voxel(x + t * dx, y + t * dy, z + t * dz, cells)

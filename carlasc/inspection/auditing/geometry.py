@@ -23,7 +23,8 @@ from carlasc.inspection.auditing.verdicts import Stretches, Verdict
 
 # A correction must raise the share of points in occupied voxels by this much, and lower the share
 # of other points by this factor.
-_GAIN, _FEWER = 0.01, 1.3  # fact: fewer-conflicts
+_GAIN = 0.01
+_FEWER = 1.3  # fact: fewer-conflicts
 _ALIKE = 0.02  # axes and lags are not distinguished if their shares differ by less; fact: alike
 _SAME = 0.25  # of the gain: corrections are not distinguished if their gains differ by less
 _FLAT = 0.006  # values are equal if their shares differ by less
@@ -99,7 +100,8 @@ def judge_geometry(stretches: Stretches, one: MatchedGrids) -> Iterator[Verdict]
         _Fit(family, part)
         for family, part in zip(kinds, np.split(shares, ends[:-1], axis=1), strict=True)
     ]
-    top, own = max(float(fit.shares[0].max()) for fit in fits), shares[:, 0]
+    top = max(float(fit.shares[0].max()) for fit in fits)
+    own = shares[:, 0]
     low, high = np.quantile(own[1:], (0.025, 0.975)).tolist()
     text = (
         f"{own[0]:.1%} of the points of scans are in occupied voxels, {top:.1%} with the best "
@@ -165,7 +167,8 @@ def _sound_or_not(fit: _Fit, where: str) -> Verdict:
     """
     family, shares, (low, high) = fit.family, fit.shares[0], fit.interval
     neutral = float(family.values[family.neutral])
-    found, unclear = (neutral, neutral, neutral), ""
+    found = (neutral, neutral, neutral)
+    unclear = ""
     if family.kind == "axes":
         text = "those of the scans"
         others = np.flatnonzero(shares[1:] >= shares[0] - _ALIKE)
@@ -209,7 +212,9 @@ def _describe(fit: _Fit, one: MatchedGrids) -> str:
     return f"the declared size is {value:.3f} times the true one {ends}, which is {true} m"
 
 
-_FINE, _VOXELS = 0.1, 1.5  # steps of a shift, in voxels, and as far as these go
+# steps of a shift, in voxels, and as far as these go
+_FINE = 0.1
+_VOXELS = 1.5
 _COARSE_M = {
     "x": np.arange(-4.0, 4.5, 0.5),
     "y": np.arange(-4.0, 4.5, 0.5),
@@ -253,14 +258,16 @@ class Family:
 @cache
 def families(spec: GridSpec) -> list[Family]:
     """Return the families of corrections of a grid."""
-    advice, still = "give grids and scans the same axes", [np.eye(3)]
+    advice = "give grids and scans the same axes"
+    still = [np.eye(3)]
     made = [_family("axes", "axes", range(len(AXES)), [m for _, m in AXES], advice)]
     advice = (
         "move the bounds, or correct the position of the sensor in the poses that the grids were "
         "made with"
     )
     for axis, name in enumerate("xyz"):
-        step, coarse = shift_step(spec, name), _COARSE_M[name]
+        step = shift_step(spec, name)
+        coarse = _COARSE_M[name]
         fine = np.arange(-round(_VOXELS / _FINE), round(_VOXELS / _FINE) + 1) * _FINE * step
         values = np.sort([*fine, *coarse[np.abs(coarse) > _VOXELS * step + 0.01]])
         shifts = _family(f"shift {name}", "shift", values, still, advice, "m", 0.2 * step, step)
@@ -270,7 +277,8 @@ def families(spec: GridSpec) -> list[Family]:
     advice = "correct the yaw of the sensor in the calibration that the grids were made with"
     made.append(_family("yaw", "yaw", _YAW_DEG, turns, advice, "degrees", 0.4, 1.5))
     anchors = {"": np.zeros(3), ", lower bound kept": np.array(spec.lower)}
-    advice, kind = "correct the declared voxel size or bounds", "voxel size"
+    advice = "correct the declared voxel size or bounds"
+    kind = "voxel size"
     for axes, which in (("", (1, 1, 1)), (" x, y", (1, 1, 0)), (" z", (0, 0, 1))):
         # the fault is declared = ratio * true size: p is in the true grid where p * ratio is in the
         # declared one

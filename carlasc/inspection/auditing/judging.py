@@ -21,13 +21,21 @@ from carlasc.inspection.heldout_scores import BANDS_M
 
 # A share is a fault from the first value on; the share of one class is a fault from the second on,
 # if it has at least so many counts.
-# fact: audit-shares
-_FREE, _FREE_OF_CLASS, _PHANTOM, _PHANTOM_OF_CLASS, _LEAST = 0.06, 0.4, 0.03, 0.2, 1000
-_TRAIL, _TRAIL_VOXELS = 0.1, 30  # of the path of an actor; fact: trail
-_ERASED, _ERASED_VOXELS = 0.2, 40  # of the voxels in which an actor was seen
+_FREE = 0.06  # fact: audit-free
+_FREE_OF_CLASS = 0.4  # fact: audit-free-class
+_PHANTOM = 0.03  # fact: audit-phantom
+_PHANTOM_OF_CLASS = 0.2  # fact: audit-phantom-class
+_LEAST = 1000
+# of the path of an actor
+_TRAIL = 0.1  # fact: trail
+_TRAIL_VOXELS = 30
+# of the voxels in which an actor was seen
+_ERASED = 0.2
+_ERASED_VOXELS = 40
 _DOUBLED = 0.05  # of the columns with ground; fact: doubled
 # least share of the points of a class under another class, and largest share under its own
-_EXPLAINED, _OWN = (0.5, 0.3)  # fact: explained
+_EXPLAINED = 0.5
+_OWN = 0.3  # fact: own-class
 # largest share under its own class, for thin markings, which lose their voxels in any case
 _NONE = 0.002
 _SHOWN = 4
@@ -199,7 +207,8 @@ class _Judge:
         ]
         text = f"{len(erased)} of {count(len(seen), 'actor')} have no voxels"
         text += f": {first_names(listed, _SHOWN)}" if erased else ""
-        advice, number = "keep the voxels of these actors", float(len(erased))
+        advice = "keep the voxels of these actors"
+        number = float(len(erased))
         yield self._say("erased actors", bool(erased), text, number, advice, "actors")
 
     @cached_property
@@ -218,7 +227,8 @@ class _Judge:
         return None if counts is None or not counts.any() else counts
 
     def _labels(self) -> Iterator[Verdict]:
-        counts, table = self._confusion, self.one.classes
+        counts = self._confusion
+        table = self.one.classes
         if counts is None or table is None:
             text = "scans or grids have no labels, or no map of their classes is known"
             yield self._say("labels", "undetermined", text)
@@ -227,7 +237,8 @@ class _Judge:
         drawn = self.stretches.draw(counts[:, used][:, :, used])
         names = [_name(table, int(i)) for i in used]
         ground = np.isin(used, self.one.ground)
-        rows, right = drawn.sum(axis=2), np.einsum("dkk->dk", drawn)
+        rows = drawn.sum(axis=2)
+        right = np.einsum("dkk->dk", drawn)
         kinds = [int(i) for i in np.flatnonzero(rows[0] >= _LEAST)]
         other = {
             i: j
@@ -272,7 +283,8 @@ class _Judge:
         counts = self._confusion
         kinds = self.stretches.stacked("classes of grids")
         if not wrong and counts is not None and kinds is not None and self.one.classes is not None:
-            met, made_of = counts.sum(axis=(0, 2)) >= _LEAST, kinds.sum(axis=0)
+            met = counts.sum(axis=(0, 2)) >= _LEAST
+            made_of = kinds.sum(axis=0)
             gone = [
                 _name(self.one.classes, i) for i in np.flatnonzero(met).tolist() if not made_of[i]
             ]

@@ -106,7 +106,8 @@ class MatchedGrids:
     @property
     def frame_name(self) -> str:
         """The frame of the grids in words."""
-        format, place = self._format, "the sensor, x forward"
+        format = self._format
+        place = "the sensor, x forward"
         return f"{place if format is None else format.place}; {self.axes}-handed"
 
     @property
@@ -168,7 +169,8 @@ class MatchedGrids:
         Raises:
             CarlascError: the grid cannot be read.
         """
-        labels, known = self.grids.labels(frame), self.grids.known(frame)
+        labels = self.grids.labels(frame)
+        known = self.grids.known(frame)
         where = f"{self.grids.location}: frame {self.grids.name_of(frame)}"
         if labels.size != self.spec.num_voxels:
             expected = f"{self.spec.num_voxels} voxels"
@@ -205,7 +207,8 @@ class MatchedGrids:
     @property
     def period_s(self) -> float:
         """Seconds between two scans."""
-        frames, seconds = [*self.seconds], [*self.seconds.values()]
+        frames = [*self.seconds]
+        seconds = [*self.seconds.values()]
         step_s = (seconds[-1] - seconds[0]) / max(frames[-1] - frames[0], 1)
         return step_s or layout.FRAME_PERIOD_S
 
@@ -278,7 +281,8 @@ def _match_frames(grids: GridFrames, scans: Sequence, chosen: FrameRange) -> Mat
     if not isinstance(grids, VoxelFrames) or grids.numbered:
         pairs = [(number, number) for number in numbers if number in set(own)]
     elif (times := _token_times(grids)) is not None:
-        seconds, pairs = np.array([*result.seconds.values()]), []
+        seconds = np.array([*result.seconds.values()])
+        pairs = []
         for number in numbers:
             if (time := times.get(grids.name_of(number))) is not None:
                 apart = np.abs(seconds - time)

@@ -28,7 +28,9 @@ from carlasc.storage.files import AnyPath, parse_json, write_output
 from carlasc.storage.parquet.parquet_source import ParquetSource
 from carlasc.storage.protocol import Source
 
-README, CROISSANT, PICTURES = "README.md", "croissant.json", "images"
+README = "README.md"
+CROISSANT = "croissant.json"
+PICTURES = "images"
 _PICTURED: tuple[Literal["grid", "scan"], ...] = ("grid", "scan")
 _SIZE = (960, 540)  # of a picture, pixels
 
@@ -175,7 +177,8 @@ def _draw(facts: Facts, folder: Path, overwrite: bool) -> tuple[list[tuple[Path,
     """
     from carlasc.viewing import Scene, StyleOptions, render
 
-    drawn, notes = [], []
+    drawn = []
+    notes = []
     for what in _PICTURED:
         for path, sequence in facts.sequences.items():
             grid = next(iter(sequence.grids), None) if what == "grid" else None

@@ -30,7 +30,8 @@ class Table(NamedTuple):
 def tables_of_card(facts: Facts) -> Iterator[Table]:
     """Yield the tables with a row or more."""
     for one in facts.statistics:
-        points, voxels = one.total.points, one.total.voxels
+        points = one.total.points
+        voxels = one.total.voxels
         shares: list[Row] = [
             {
                 "id": index,

@@ -19,7 +19,8 @@ from carlasc.storage import layout
 
 Json = dict[str, Any]
 
-_PARQUET, _BYTES = "application/x-parquet", "application/octet-stream"
+_PARQUET = "application/x-parquet"
+_BYTES = "application/octet-stream"
 
 
 @cache
@@ -156,7 +157,8 @@ def _record_set(name: str, title: str, fields: Mapping[str, Json], **content: An
 
 def _inline(table: Table) -> Json:
     """Return a table of the card as a record set that holds its records."""
-    name, kinds = _id(table.name), {str: "sc:Text", int: "sc:Integer"}
+    name = _id(table.name)
+    kinds = {str: "sc:Text", int: "sc:Integer"}
     fields = {
         column: {"dataType": kinds.get(type(value), "sc:Float")}
         for column, value in table.rows[0].items()
@@ -167,7 +169,8 @@ def _inline(table: Table) -> Json:
 
 def _published(table: PublishedTable) -> Json:
     """Return the record set of a table of a store; lists of fixed length are arrays."""
-    name, fields = _id(table.name), {}
+    name = _id(table.name)
+    fields = {}
     for column, type_ in table.columns.items():
         about: Json = {"dataType": vocabulary()["types"].get(type_, "sc:Text")}
         if type_.startswith("fixed_size_list"):

@@ -175,7 +175,8 @@ class Facts:
         """The sequences that were recorded in a simulator, as their carlasc.json says: "all", "2 of
         3 sequences", or "" for none.
         """
-        number, count = len(_recorded(self.metadata)), len(self.sequences)
+        number = len(_recorded(self.metadata))
+        count = len(self.sequences)
         if number == count:
             return ""
         return f"{count - number} of {count} sequences" if number else "all"
@@ -275,7 +276,8 @@ def gather(
         )
     overview = info(source)
     tables: dict[str, dict[str, StoredSequence]] = {}
-    reports, counted = {}, []
+    reports = {}
+    counted = []
     for one in overview.sequences:
         # A grid that cannot be described would be missing from the card without a message.
         if one.problem:

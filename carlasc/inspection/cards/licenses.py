@@ -78,7 +78,8 @@ def find_license(text: str) -> License | None:
     """Return the licence of a name such as "CC BY 4.0" or "cc-by-4.0", or of the address of a
     licence's text; None for another text.
     """
-    stripped, licenses = text.strip(), _licenses()
+    stripped = text.strip()
+    licenses = _licenses()
     if re.fullmatch(r"https?://[^\s\"'<>]+", stripped):
         # a deed, /legalcode or a country may follow the address of a licence of Creative Commons
         common = r"creativecommons\.org/licenses/([a-z-]+)/(\d\.\d)\b"
@@ -156,7 +157,8 @@ def licensed_parts(
     """
     paths_of: dict[tuple[str | None, License | None], list[str]] = {}
     for sequence in sequences:
-        license_, source = _license_of(sequence), sequence.metadata.source
+        license_ = _license_of(sequence)
+        source = sequence.metadata.source
         if license_ is not None and license_.derivatives is False:
             raise CarlascError(
                 sequence.location,

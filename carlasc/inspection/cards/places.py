@@ -154,6 +154,7 @@ def place_of(source: AnyPath | Source, out: Path | None, url: str | None) -> tup
         raise ArgumentError("source", expected="data on this machine, or their URL", found=location)
     beside = given.is_file() or (given / "zarr.json").is_file()
     chosen = out or (given.parent if beside else given)
-    local, folder = given.resolve(), chosen.resolve()
+    local = given.resolve()
+    folder = chosen.resolve()
     name = local.relative_to(folder).as_posix() if local.is_relative_to(folder) else local.name
     return Place(location, local, "" if name == "." else name, local.is_file(), repository), chosen

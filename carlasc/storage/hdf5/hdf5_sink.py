@@ -188,7 +188,8 @@ class HDF5ColumnWriter:
         if not self._held:
             return
         encoded = in_threads(lambda one: self._encoding.encode(one[2]), self._held)
-        step, shape = self._dataset.chunks[-1], self._dataset.shape
+        step = self._dataset.chunks[-1]
+        shape = self._dataset.shape
         needed = (max(number for _, number, _ in self._held) + 1) * step
         self._dataset.resize((self._held[-1][0] + 1, *shape[1:-1], max(shape[-1], needed)))
         for (frame, number, _), data in zip(self._held, encoded, strict=True):
@@ -236,7 +237,8 @@ class HDF5Output:
 
     def create(self, node: str, field_layout: FieldLayout, column: Column) -> Any:
         """Create the data set of a column, without frames."""
-        shape, encoding = field_layout.frame_shape(column), column.encoding
+        shape = field_layout.frame_shape(column)
+        encoding = column.encoding
         # rarely, a frame is longer, and the axis grows
         most = shape if field_layout.is_grid else (*shape[:-1], None)
         blosc = self._filters.Blosc(cname="zstd", clevel=encoding.level, shuffle=encoding.shuffle)
@@ -283,5 +285,6 @@ def _write_attributes(node: Any, attributes: dict[str, Any]) -> None:
 
 
 def _fixed_text(text: str) -> AnyArray:
-    h5py, data = import_extra("h5py", "hdf5"), text.encode()
+    h5py = import_extra("h5py", "hdf5")
+    data = text.encode()
     return np.array(data, h5py.string_dtype("utf-8", max(1, len(data))))

@@ -25,7 +25,10 @@ from carlasc.storage.transport.remote_tree import RemoteTree
 from carlasc.storage.transport.trees import Tree
 
 _BLOSC = 32001  # registered number of the filter
-_GZIP, _SHUFFLE, _FLETCHER32 = 1, 2, 3  # filters of HDF5 itself
+# filters of HDF5 itself
+_GZIP = 1
+_SHUFFLE = 2
+_FLETCHER32 = 3
 _SMALL_FILTERS = {_GZIP, _SHUFFLE, _FLETCHER32}
 _UNTRUSTED = "carlasc did not write this: do not use this store"
 CRC = "_crc32c"  # suffix of the data set with the checksums of the chunks
@@ -234,11 +237,9 @@ def check_small(dataset: Any, what: str) -> None:
     Raises:
         FormatError: it is too large, or has values or filters that carlasc does not write.
     """
-    size, stored, filters = (
-        dataset.size * dataset.dtype.itemsize,
-        dataset.id.get_storage_size(),
-        _filters(dataset),
-    )
+    size = dataset.size * dataset.dtype.itemsize
+    stored = dataset.id.get_storage_size()
+    filters = _filters(dataset)
     if dataset.dtype.kind not in "uif" or not set(filters) <= _SMALL_FILTERS:
         raise damaged(what, "numbers without filters or with gzip", "other data", _UNTRUSTED)
     check_ratio(size, stored, what)

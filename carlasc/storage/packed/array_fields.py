@@ -64,11 +64,13 @@ class ArrayField:
         """The columns that are stored."""
         columns = {}
         for name, counts in self._counts.items():
-            column, array = self.layout.columns[name], self._array_of(name)
+            column = self.layout.columns[name]
+            array = self._array_of(name)
             self.layout.check(
                 array, column, int(self.frames[-1]), int(counts.max()), f"{self.where}/{name}"
             )
-            firsts, elements = self.frames * array.slots, np.maximum(counts, 0)
+            firsts = self.frames * array.slots
+            elements = np.maximum(counts, 0)
             columns[name] = StoredColumn(
                 column, array, firsts.tolist(), elements.tolist(), self.layout.is_grid
             )
@@ -209,9 +211,11 @@ class StoredColumn:
 
     def parts(self, positions: list[int]) -> list[FramePart]:
         """Return the parts that hold some frames."""
-        step, parts = self.array.step, []
+        step = self.array.step
+        parts = []
         for position in positions:
-            first, count = self.firsts[position], self.counts[position]
+            first = self.firsts[position]
+            count = self.counts[position]
             chunks = min(count, 1) if self.is_grid else -(-count // step)
             if not self.is_grid:
                 check_size(
@@ -250,8 +254,10 @@ class StoredColumn:
             return self._decode_chunk(
                 parts[0], task.chunks[0], np.empty(self.array.chunk, self.array.dtype)
             )[0]
-        step, rows = self.array.step, self.column.rows or 1
-        shape, dtype = (rows, len(parts) * step), self.array.dtype
+        step = self.array.step
+        rows = self.column.rows or 1
+        shape = (rows, len(parts) * step)
+        dtype = self.array.dtype
         if out is None:
             out = scratch(shape, dtype) if self.column.scratch else np.empty(shape, dtype)
         if len(parts) == 1:  # nearly always

@@ -22,12 +22,10 @@ from carlasc.storage.packed.chunks import StoredArray
 from carlasc.storage.packed.columns import FEW, LEAST, Column, Packing, packing_of
 from carlasc.storage.packed.stores import VERSION, PackOptions, check_scale
 
-SEQUENCE, FIELD, COLUMN, DOCUMENT = (
-    "carlasc.sequence",
-    "carlasc.field",
-    "carlasc.column",
-    "carlasc.document",
-)
+SEQUENCE = "carlasc.sequence"
+FIELD = "carlasc.field"
+COLUMN = "carlasc.column"
+DOCUMENT = "carlasc.document"
 _SLOTS = 16  # a frame has room for this many typical frames
 _PCODEC = "pcodec"  # value of the attribute `codec` of points that PCodec compressed
 _HEADROOM = (
@@ -124,7 +122,8 @@ class FieldLayout:
         """
         if self.is_grid:
             return tuple(self.attributes["shape"])
-        typical, step = self._typical(column), self._step(column)
+        typical = self._typical(column)
+        step = self._step(column)
         return (*((column.rows,) if column.rows else ()), -(-_SLOTS * typical // step) * step)
 
     def chunk_shape(self, column: Column) -> tuple[int, ...]:
@@ -203,7 +202,8 @@ class FieldLayout:
                                       f"frames",
                 found=array.shape,
             )  # fmt: skip
-        counts, chunks = {}, {}
+        counts = {}
+        chunks = {}
         parts = self.packing.split(array)
         for family in self.packing.columns:
             values = parts.get(family.name)

@@ -33,7 +33,9 @@ _EXTRA = "zarr"
 _T = TypeVar("_T")
 _R = TypeVar("_R")
 
-NO_SHUFFLE, SHUFFLE, BITSHUFFLE = 0, 1, 2
+NO_SHUFFLE = 0
+SHUFFLE = 1
+BITSHUFFLE = 2
 _BLOSC_HEADER = struct.Struct("<4B3I")
 # bytes that Blosc compresses together: a whole scan, because smaller blocks compress less
 BLOCK = 1 << 21

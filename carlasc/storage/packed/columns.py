@@ -161,7 +161,8 @@ class PointsPacking(Packing):
 
     def join(self, columns: Columns, into: AnyArray | None = None) -> AnyArray:
         """Return (N, 4) float32 rows, as in the published file."""
-        xyz, fourth = columns["xyz"], columns["fourth"]
+        xyz = columns["xyz"]
+        fourth = columns["fourth"]
         points = np.empty((xyz.shape[1], 4), np.float32) if into is None else into
         # one assignment of all three takes five times as long
         points[:, 0], points[:, 1], points[:, 2] = self.to_metres(xyz)
@@ -255,7 +256,8 @@ class FlowPacking(Packing):
 
     def join(self, columns: Columns, into: AnyArray | None = None) -> AnyArray:
         """Return (N, 3) float32."""
-        index, palette = columns["index"], columns["palette"]
+        index = columns["index"]
+        palette = columns["palette"]
         if index.size and int(index.max()) >= palette.shape[1]:
             raise damaged("its index", f"indices below {palette.shape[1]}", str(int(index.max())))
         return np.ascontiguousarray(palette.T)[index]

@@ -118,7 +118,8 @@ class DeferredErrorFile(io.RawIOBase):
             StorageError: it cannot be created.
         """
         super().__init__()
-        self._path, self._place = path, place
+        self._path = path
+        self._place = place
         self._position = self._size = 0
         self._error: OSError | KeyboardInterrupt | None = None
         self._descriptor = -1  # until it is open

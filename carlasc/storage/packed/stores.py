@@ -159,7 +159,8 @@ class PackedSequence(Sequence, Generic[_FieldReader]):
             self.split: str | None = about["split"]
             self.name: str = about["name"]
             self.coordinates = cast(Coordinates, about["coordinates"])
-            self._fields, self._documents = frozenset(about["fields"]), tuple(about["documents"])
+            self._fields = frozenset(about["fields"])
+            self._documents = tuple(about["documents"])
         except KeyError as error:
             raise damaged(location, f"the attribute {error.args[0]}", "none") from error
         except TypeError as error:
@@ -228,7 +229,8 @@ class PackedSink(Sink):
             ArgumentError: `small` is given, but only zarr has PCodec.
             ConflictError: something exists at `path`, and `overwrite` is not given.
         """
-        self.path, self.location = Path(path), str(path)
+        self.path = Path(path)
+        self.location = str(path)
         self.part = unfinished(self.path)
         self.options = options or PackOptions()
         self.overwrite = overwrite

@@ -88,7 +88,8 @@ def split_columns(
         return {"voxel": np.ascontiguousarray(array["voxel"]), **velocity}
     if array.dtype.names:
         return {name: np.ascontiguousarray(array[name]) for name in types}
-    rows, scale = array.reshape(-1, len(types)), attributes.get("scale_m")
+    rows = array.reshape(-1, len(types))
+    scale = attributes.get("scale_m")
     return {
         name: quantise(rows[:, k], scale)
         if scale and name in AXES

@@ -141,7 +141,8 @@ class Cache:
         Raises:
             FileNotFoundError: it was removed to make room.
         """
-        path, now = self.path(name), time.time_ns()
+        path = self.path(name)
+        now = time.time_ns()
         with suppress(PermissionError):  # it belongs to another user: its times cannot be set
             os.utime(path, ns=(now, now if compared else path.stat().st_mtime_ns))
 

@@ -40,7 +40,8 @@ class Client(ABC):
     def __init__(self, url: str, options: Mapping[str, Any]) -> None:
         from fsspec.config import conf
 
-        self.url, self.scheme = url, url.partition("://")[0]
+        self.url = url
+        self.scheme = url.partition("://")[0]
         self.options = {**conf.get(self.scheme, {}), **options}
         self.settings = RemoteSettings.from_environment()
         self._opened: tuple[int, Any] | None = None

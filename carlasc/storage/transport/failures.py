@@ -152,7 +152,8 @@ def describe_failure(error: BaseException) -> str:
         return "no answer, or one that does not fit the request"
     if status:
         return f"{status} {code}".strip()
-    name, reason = type(error).__name__, getattr(error, "strerror", None)
+    name = type(error).__name__
+    reason = getattr(error, "strerror", None)
     return f"{name} ({reason})" if reason and isinstance(error, OSError) else name
 
 

@@ -95,7 +95,9 @@ class FileFetch:
         Raises:
             CarlascError: the server cannot be reached, or the file does not exist or is not a zip.
         """
-        self._where, self._path, self._connections = without_credentials(url), path, connections
+        self._where = without_credentials(url)
+        self._path = path
+        self._connections = connections
         self._part, self._record = (
             path.with_name(f"{path.name}{end}") for end in (".part", ".part.json")
         )
@@ -168,7 +170,9 @@ class FileFetch:
             advance: called with the number of new bytes.
             most: maximum size in bytes, if the server does not report the size.
         """
-        stop, lock, size = threading.Event(), threading.Lock(), self.file.size
+        stop = threading.Event()
+        lock = threading.Lock()
+        size = self.file.size
         blocks = range(math.ceil((size or 0) / _BLOCK)) if self.file.ranges else range(1)
         descriptor = os.open(self._part, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
         executor = ThreadPoolExecutor(self._connections, thread_name_prefix="download")

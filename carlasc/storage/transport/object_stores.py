@@ -137,7 +137,8 @@ class ObjectStoreClient(Client):
         A whole object is requested as the range from its first byte: that answer names the size of
         the object, so that a short one is noticed.
         """
-        store, key = self.connection[0], self._key(url)
+        store = self.connection[0]
+        key = self._key(url)
         try:
             if start is not None and end is not None:
                 return bytes(_library().get_range(store, key, start=start, end=end))
@@ -153,7 +154,8 @@ class ObjectStoreClient(Client):
 
     def about(self, url: str) -> tuple[int, str] | None:
         """Describe an object."""
-        store, key = self.connection[0], self._key(url)
+        store = self.connection[0]
+        key = self._key(url)
         if not key:
             return None
         try:
@@ -194,7 +196,9 @@ class ObjectStoreClient(Client):
         If the answer to a create-only put is lost, the put is sent again and finds its own object:
         it has the mark.
         """
-        library, store, key = _library(), self.connection[1], self._key(url)
+        library = _library()
+        store = self.connection[1]
+        key = self._key(url)
         if mark is None:
             library.put(store, key, data, chunk_size=_PART_BYTES)
             return True
@@ -210,7 +214,8 @@ class ObjectStoreClient(Client):
 
     def remove(self, urls: Iterable[str]) -> None:
         """Remove objects, in S3 1000 per request."""
-        keys, store = [self._key(url) for url in urls], self.connection[1]
+        keys = [self._key(url) for url in urls]
+        store = self.connection[1]
         if self.scheme in _S3:
             _library().delete(store, keys)
             return

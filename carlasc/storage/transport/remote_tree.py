@@ -59,7 +59,8 @@ class RemoteTree(Tree):
         """
         base, mark, query = url.partition("?") if url.startswith("http") else (url, "", "")
         # a signed URL: the signature follows each path
-        self._base, self._query = base.rstrip("/"), mark + query
+        self._base = base.rstrip("/")
+        self._query = mark + query
         self.location = without_credentials(self._base)
         kind = _CLIENTS.get(url.partition("://")[0], FileSystemClient)
         self.client = kind(url.rstrip("/"), options or {})
@@ -76,7 +77,8 @@ class RemoteTree(Tree):
         """Return the tree of a folder in this one."""
         tree = copy.copy(self)
         if folder:
-            tree._base, tree.location = f"{self._base}/{folder}", self.where(folder)
+            tree._base = f"{self._base}/{folder}"
+            tree.location = self.where(folder)
         tree._listed = {}
         return tree
 
@@ -113,7 +115,8 @@ class RemoteTree(Tree):
 
     def note(self, path: str, exists: bool) -> None:
         """Update listings after this process wrote a file or removed it."""
-        name, is_folder = path, False
+        name = path
+        is_folder = False
         while name:
             folder, _, base = name.rpartition("/")
             listed = self._listed.get(folder, {})
@@ -121,7 +124,8 @@ class RemoteTree(Tree):
                 listed[base] = is_folder
             elif not is_folder:
                 listed.pop(base, None)
-            name, is_folder = folder, True
+            name = folder
+            is_folder = True
 
     def is_file(self, path: str) -> bool:
         """Whether the file exists, from the listing of its folder, or from the server if folders
@@ -245,7 +249,9 @@ class RemoteFile(io.RawIOBase):
 
         `fetch` returns the bytes [start, end). Nothing is fetched yet.
         """
-        self._fetch, self._size, self._place = fetch, size, 0
+        self._fetch = fetch
+        self._size = size
+        self._place = 0
         self._block = lru_cache(_KEPT)(self._fetch_block)
 
     def _fetch_block(self, number: int) -> bytes | memoryview:
@@ -269,13 +275,15 @@ class RemoteFile(io.RawIOBase):
     def readinto(self, buffer: bytearray | memoryview) -> int:  # type: ignore[override]
         """Read bytes into a buffer, and return their number."""
         view = memoryview(buffer).cast("B")
-        start, end = self._place, min(self._place + len(view), self._size)
+        start = self._place
+        end = min(self._place + len(view), self._size)
         if start >= end:
             return 0
         if end - start > _BLOCK:
             data = self._fetch(start, end)
         else:
-            first, last = start // _BLOCK, (end - 1) // _BLOCK
+            first = start // _BLOCK
+            last = (end - 1) // _BLOCK
             blocks = b"".join(map(self._block, range(first, last + 1)))
             data = blocks[start - first * _BLOCK : end - first * _BLOCK]
         view[: end - start] = data

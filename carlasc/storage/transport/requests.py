@@ -127,7 +127,8 @@ def persist(
     Raises:
         Exception: the error of the last attempt.
     """
-    attempts, before = 0, count()
+    attempts = 0
+    before = count()
     while True:
         try:
             return work()

@@ -108,7 +108,8 @@ class LocalTree(Tree):
             mapped: whether `read` maps files into memory, so that only the used parts are read.
                 Files must then not be changed in place.
         """
-        self.root, self.mapped = Path(root), mapped
+        self.root = Path(root)
+        self.mapped = mapped
         self.location = str(self.root)
 
     def below(self, folder: str) -> LocalTree:

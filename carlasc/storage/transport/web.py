@@ -76,7 +76,8 @@ class WebClient(Client):
                     return
             finally:
                 answer.close()
-            before, place = urlsplit(place), urljoin(place, target)
+            before = urlsplit(place)
+            place = urljoin(place, target)
             after = urlsplit(place)
             if after.scheme not in (before.scheme, "https"):
                 break
@@ -97,10 +98,12 @@ class WebClient(Client):
                 per second has arrived.
             Exception: the connection broke (an error of urllib3).
         """
-        count, began = 0, time.monotonic()
+        count = 0
+        began = time.monotonic()
         while piece := answer.read1(_PIECE, decode_content=False):
             yield piece
-            count, elapsed_s = count + len(piece), time.monotonic() - began
+            count = count + len(piece)
+            elapsed_s = time.monotonic() - began
             if elapsed_s > self.settings.timeout_s and count < _SLOWEST * elapsed_s:
                 raise TimeoutError(f"{count} bytes in {elapsed_s:.0f} s")
 
@@ -119,7 +122,8 @@ class WebClient(Client):
         """
         wanted = dict(headers or {})
         if start is not None and end is not None:
-            most, wanted["Range"] = end - start, f"bytes={start}-{end - 1}"
+            most = end - start
+            wanted["Range"] = f"bytes={start}-{end - 1}"
         with self.answer(url, wanted) as answer:
             if answer.status == 416:  # the range starts after the end of the file
                 return b""
@@ -145,7 +149,8 @@ class WebClient(Client):
         """Describe a file, from the headers of an answer. Some servers refuse HEAD."""
         for method in ("HEAD", "GET"):
             with self.answer(url, {}, method) as answer:
-                headers, status = answer.headers, answer.status
+                headers = answer.headers
+                status = answer.status
             if status == 404:
                 return None
             if status < 300:

@@ -39,8 +39,12 @@ _LENGTHS = struct.Struct("<3H")  # of the name, the extra field and the comment,
 _WIDE = 0xFFFFFFFF  # the value is in the 64-bit extra field
 # the end record, its longest comment, and the locator before it
 _TAIL = _END.size + 65535 + _END64_LOCATOR.size
-_STORED, _DEFLATED = 0, 8  # methods
-_ENCRYPTED, _UTF8 = 1, 0x800  # flags
+# methods
+_STORED = 0
+_DEFLATED = 8
+# flags
+_ENCRYPTED = 1
+_UTF8 = 0x800
 # additional bytes to fetch: the extra field of the local header may be longer than in the central
 # directory
 _SLACK = 64
@@ -57,7 +61,8 @@ class ZipTree(Tree):
 
         Its central directory is read on first use, once per process.
         """
-        self.tree, self.path = tree, path
+        self.tree = tree
+        self.path = path
         self.location = tree.where(path)
 
     @cached_property
@@ -118,7 +123,8 @@ class ZipTree(Tree):
         """Return the bytes of a member from a range that starts with its local header and may end
         after the member.
         """
-        where, is_encrypted = self.where(path), member["flags"] & _ENCRYPTED
+        where = self.where(path)
+        is_encrypted = member["flags"] & _ENCRYPTED
         if is_encrypted or member["method"] not in (_STORED, _DEFLATED):
             raise FormatError(
                 where,
@@ -284,7 +290,8 @@ def _add_folder(folders: _Folders, folder: str) -> None:
 
 def _names(data: bytes, begins: IntArray, columns: _Columns) -> list[str]:
     """Return the names of the members, in UTF-8 or in code page 437."""
-    ends, are_utf8 = begins + columns["name"], columns["flags"] & _UTF8
+    ends = begins + columns["name"]
+    are_utf8 = columns["flags"] & _UTF8
     names = []
     for begin, end, is_utf8 in zip(begins.tolist(), ends.tolist(), are_utf8.tolist(), strict=True):
         name = data[begin:end]

@@ -149,7 +149,10 @@ class StoredField:
             for block, table in self._tables.items()
             if len(table) == self.options.block
         }
-        self._tables, self._listed_s, self._denied, self._asked = dict(whole), None, set(), 0
+        self._tables = dict(whole)
+        self._listed_s = None
+        self._denied = set()
+        self._asked = 0
 
     def _exists(self, frame: int) -> bool:
         return frame in self._tables.get(frame // self.options.block, {})
@@ -231,7 +234,8 @@ class StoredField:
         field_layout = self._known_layout()
         array = self._array(field_layout, name, block)
         slots = array.slots
-        path, room = array.file(block), array.per_shard or 1
+        path = array.file(block)
+        room = array.per_shard or 1
         places = {frame: frame % self.options.block * slots for frame in frames}
         new = {
             places[f] + k: chunk
@@ -264,7 +268,8 @@ class StoredField:
     def remove(self, frames: set[int]) -> None:
         """Remove frames from the tables of their blocks."""
         for block in {frame // self.options.block for frame in frames}:
-            path, there = table_path(self.node, block), self.table(block)
+            path = table_path(self.node, block)
+            there = self.table(block)
             self._tables[block] = {f: counts for f, counts in there.items() if f not in frames}
             if not self._tables[block]:
                 self.target.remove(path)

@@ -38,12 +38,10 @@ class StoreRoot:
         """
         if isinstance(target, LocalTarget) and not target.folder.name:
             raise ArgumentError("out", expected="the name of a store", found=f"{target.location!r}")
-        self._target, self._options, self._overwrite, self._begun = (
-            target,
-            options,
-            overwrite,
-            False,
-        )
+        self._target = target
+        self._options = options
+        self._overwrite = overwrite
+        self._begun = False
         root = read_root(target)
         if root is None:
             _refuse_other(target)

@@ -62,14 +62,13 @@ class ZarrArray(StoredArray):
             FormatError: carlasc does not write such codecs or chunks.
         """
         with reading(tree.where(node), "the codecs and chunks that carlasc writes"):
-            shape, dtype = (
-                _numbers(metadata["shape"], 0),
-                np.dtype(metadata["data_type"]).newbyteorder("<"),
-            )
+            shape = _numbers(metadata["shape"], 0)
+            dtype = np.dtype(metadata["data_type"]).newbyteorder("<")
             if dtype.kind not in "uif":
                 raise ValueError(f"elements of {dtype.name}")
             outer = _numbers(metadata["chunk_grid"]["configuration"]["chunk_shape"], 1)
-            codecs, chunk = metadata["codecs"], outer
+            codecs = metadata["codecs"]
+            chunk = outer
             if sharded := codecs[0]["name"] == "sharding_indexed":
                 chunk = _numbers(codecs[0]["configuration"]["chunk_shape"], 1)
                 codecs = codecs[0]["configuration"]["codecs"]

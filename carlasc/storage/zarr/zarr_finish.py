@@ -88,7 +88,8 @@ class StoreNodes:
     ) -> None:
         """Add the groups of the fields of a sequence, and the columns that frames use."""
         for name, found in fields.items():
-            group, table = f"{node}/{field_node(name)}", tables[name]
+            group = f"{node}/{field_node(name)}"
+            table = tables[name]
             self.group(group, found.attributes)
             room = -(-(max(table) + 1) // block) * block
             for column in found.columns.values():
@@ -154,7 +155,8 @@ def _look_at(target: Target, found: Mapping[str, Sequence]) -> FinishedStore:
     result = FinishedStore(target.location)
     for path, sequence in found.items():
         result.sequences[path] = {name: len(sequence.frames(name)) for name in sequence.fields()}
-        writer, missing = FolderWriter(target.below(path)), dict[str, int]()
+        writer = FolderWriter(target.below(path))
+        missing = dict[str, int]()
         for grid in sequence.grids:
             announced = map(int, MadeFrom.read(writer, f"made-{grid}").frames)
             missing[grid] = sum(not writer.has(f"{grid}/labels", frame) for frame in announced)
@@ -169,7 +171,8 @@ def _finish_store(target: Target, incomplete: bool) -> FinishedStore:
     paths = sorted(target.paths())
     while True:
         result = _write_metadata(target, paths, incomplete)
-        before, paths = paths, sorted(target.paths())
+        before = paths
+        paths = sorted(target.paths())
         if _tables_of(before) == _tables_of(paths):
             return result
         # another process has added frames meanwhile, and may have written older metadata after it
@@ -187,7 +190,8 @@ def _write_metadata(target: Target, paths: list[str], incomplete: bool) -> Finis
         )
     if not isinstance(block := root.get("block"), int) or block < 1:
         raise damaged(target.location, "a number of frames in block", repr(block))
-    groups, tables = _groups(target, paths), _read_tables(target, paths)
+    groups = _groups(target, paths)
+    tables = _read_tables(target, paths)
     result = FinishedStore(target.location)
     nodes = StoreNodes()
     sequences = dict[str, str]()

@@ -202,7 +202,8 @@ class ZarrWriter(SequenceWriter):
         """Remove fields of some frames, if they exist. Their bytes stay in the objects of their
         blocks until these are written again.
         """
-        gone, known = {*frames}, read_expected(self.target, self.group)
+        gone = {*frames}
+        known = read_expected(self.target, self.group)
         left = known | {name: known[name] - gone for name in {*fields} & known.keys()}
         if left != known:
             self.target.put(f"{self.group}/{EXPECTED}", format_expected(left))

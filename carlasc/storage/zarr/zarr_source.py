@@ -101,7 +101,8 @@ class ZarrStore(ArrayStore):
     def _metadata(self, node: str) -> dict[str, Any] | None:
         if not node:
             return self._root
-        where, nodes = self.tree.where(METADATA), self._root
+        where = self.tree.where(METADATA)
+        nodes = self._root
         for name in ("consolidated_metadata", "metadata"):
             nodes = _mapping(nodes.get(name), where, name)
         if node not in nodes:

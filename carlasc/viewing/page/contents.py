@@ -383,7 +383,8 @@ class PageContent:
         """
         if self.reader.truth is None:
             return {}
-        truth, classes = grids[1], self.reader.table.num_channels
+        truth = grids[1]
+        classes = self.reader.table.num_channels
         matrices = [
             ConfusionMatrix(classes).update(grid.labels, truth.labels, truth.known)
             for grid, panel in zip(grids, self.panels, strict=True)

@@ -144,7 +144,8 @@ def record_frames(reader: SceneReader, max_points: int | None) -> Iterator[Recor
     """
     trails = Trails()
     for position, number in enumerate(reader.frames):
-        content, fields = reader.read(number), dict[str, Any]()
+        content = reader.read(number)
+        fields = dict[str, Any]()
         scan = content.scan
         moving = reader.read_motion(number, scan)
         if content.time_s is None:

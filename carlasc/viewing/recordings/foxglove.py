@@ -35,12 +35,15 @@ from carlasc.viewing import colors as palette
 from carlasc.viewing.recordings.content import RecordedFrame, class_surfaces
 from carlasc.viewing.scene import GridPanel, SceneReader
 
-WORLD, EGO = "world", "ego"
+WORLD = "world"
+EGO = "ego"
 
 _RGB = ("red", "green", "blue")
 _CELL = [*((name, "u1") for name in (*_RGB, "alpha")), ("label", "<u2")]
 _POINT = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), *_CELL]
-_BOX_ALPHA, _LINE_M, _ARROW_M = 0.35, 0.15, 0.24
+_BOX_ALPHA = 0.35
+_LINE_M = 0.15
+_ARROW_M = 0.24
 
 
 class FoxgloveWriter:
@@ -54,7 +57,8 @@ class FoxgloveWriter:
         foxglove: Any = import_extra("foxglove", "foxglove")
         self._messages: Any = import_extra("foxglove.messages", "foxglove")
         self._types: Any = import_extra("foxglove.channels", "foxglove")
-        self._reader, self._channels = reader, dict[str, Any]()
+        self._reader = reader
+        self._channels = dict[str, Any]()
         self._context = foxglove.Context()
         self._output = DeferredErrorFile(path, None)
         self._writer = foxglove.open_mcap(self._output, context=self._context)
@@ -73,7 +77,8 @@ class FoxgloveWriter:
 
     def write(self, frame: RecordedFrame) -> None:
         """Append a frame."""
-        m, nanoseconds = self._messages, round(frame.time_s * 1e9)
+        m = self._messages
+        nanoseconds = round(frame.time_s * 1e9)
         stamp = m.Timestamp(*divmod(nanoseconds, 10**9))
         ego = {"timestamp": stamp, "frame_id": EGO}
 
@@ -159,7 +164,8 @@ class FoxgloveWriter:
         columns, rows, slices = grid.spec.size
         labels = grid.labels.transpose(2, 1, 0)
         cells = np.zeros((slices, rows, columns), _CELL)
-        cells["alpha"], cells["label"] = np.where(labels, 255, 0), labels
+        cells["alpha"] = np.where(labels, 255, 0)
+        cells["label"] = labels
         for name, values in zip(_RGB, panel.colors.by_id.T, strict=True):
             cells[name] = np.where(labels, values[labels], 0)
         corner = np.eye(4)
@@ -214,7 +220,8 @@ class FoxgloveWriter:
         """Yield each box as an entity that is named by its track."""
         m = self._messages
         for row, pose in enumerate(boxes.sensor_T_box):
-            label, track = int(boxes.labels[row]), str(boxes.tracks[row])
+            label = int(boxes.labels[row])
+            track = str(boxes.tracks[row])
             name = self._reader.table.names.get(label, f"class {label}")
             cube = m.CubePrimitive(
                 pose=self._pose(pose),
@@ -234,7 +241,8 @@ class FoxgloveWriter:
         side = np.cross([0.0, 0.0, 1.0] if abs(ahead[2]) < 0.9 else [0.0, 1.0, 0.0], ahead)
         side /= np.linalg.norm(side)
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = np.column_stack([ahead, side, np.cross(ahead, side)]), tail
+        pose[:3, :3] = np.column_stack([ahead, side, np.cross(ahead, side)])
+        pose[:3, 3] = tail
         head = min(4.5 * _ARROW_M, 0.5 * length)
         return self._messages.ArrowPrimitive(
             pose=self._pose(pose),

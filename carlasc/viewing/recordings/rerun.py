@@ -44,10 +44,8 @@ _IMAGES = 2  # cameras whose images have views of their own
 _FRUSTUM_M = 2.0  # from a camera to where its image is drawn
 _BACKGROUND = (246, 247, 249)
 # behind and above: a published grid fits in a square view
-_EYE, _TARGET = (
-    (-49.0, 0.0, 35.0),
-    (-3.0, 0.0, -3.0),
-)
+_EYE = (-49.0, 0.0, 35.0)
+_TARGET = (-3.0, 0.0, -3.0)
 
 
 class RerunWriter:
@@ -77,7 +75,8 @@ class RerunWriter:
 
     def write(self, frame: RecordedFrame) -> None:
         """Append a frame."""
-        rr, log = self._rr, self._recording.log
+        rr = self._rr
+        log = self._recording.log
         self._recording.set_time("frame", sequence=frame.number)
         self._recording.set_time("time", duration=frame.time_s)
         for panel, grid in zip(self._reader.panels, frame.grids, strict=True):
@@ -109,10 +108,8 @@ class RerunWriter:
         if frame.pose is not None:
             rotation = np.roll(quaternions_of(frame.pose[None, :3, :3])[0], -1)  # x, y, z, w
             log("world/ego", rr.Transform3D(translation=frame.pose[:3, 3], quaternion=rotation))
-            ways, classes = (
-                [trail.points for trail in frame.trails],
-                [trail.label for trail in frame.trails],
-            )
+            ways = [trail.points for trail in frame.trails]
+            classes = [trail.label for trail in frame.trails]
             log(
                 "world/tracks",
                 rr.LineStrips3D(
@@ -144,7 +141,8 @@ class RerunWriter:
 
     def _write_static(self) -> None:
         """Write the entities that are the same in all frames."""
-        rr, reader = self._rr, self._reader
+        rr = self._rr
+        reader = self._reader
 
         def log(entity: str, *content: Any) -> None:
             self._recording.log(entity, *content, static=True)
@@ -168,7 +166,8 @@ class RerunWriter:
 
     def _write_grid(self, panel: GridPanel, grid: Grid) -> None:
         """Write the voxels of each class, and clear classes that only the previous frame had."""
-        rr, colors = self._rr, panel.colors.by_id
+        rr = self._rr
+        colors = panel.colors.by_id
         if grid.spec.coordinates == "cylindrical":
             drawn = {
                 label: self._mesh(surface, albedo_factor=colors[label])
@@ -212,7 +211,9 @@ class RerunWriter:
         """Write the image and the pose of a camera; distortion is left out, because Rerun has no
         model of it.
         """
-        rr, camera, place = self._rr, photo.camera, photo.ego_T_camera
+        rr = self._rr
+        camera = photo.camera
+        place = photo.ego_T_camera
         name = f"world/ego/cameras/{rr.escape_entity_path_part(camera.name)}"
         lens = rr.Pinhole(
             image_from_camera=camera.matrix,
@@ -237,7 +238,8 @@ class RerunWriter:
         """Return the views at the start: the grids side by side, the points and the picture beside
         or below them.
         """
-        blueprint, reader = self._rr.blueprint, self._reader
+        blueprint = self._rr.blueprint
+        reader = self._reader
         names = [panel.name for panel in reader.panels]
         grids = [
             self._view(

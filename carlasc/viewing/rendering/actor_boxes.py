@@ -85,7 +85,8 @@ def tight_boxes(scan: Scan) -> Boxes:
         )
         sensor_T_box = rotation_z(_direction(points[:, :2], velocity))
         turned = points @ sensor_T_box[:3, :3]
-        lower, upper = turned.min(axis=0), turned.max(axis=0)
+        lower = turned.min(axis=0)
+        upper = turned.max(axis=0)
         sensor_T_box[:3, 3] = sensor_T_box[:3, :3] @ ((lower + upper) / 2)
         tracks.append(actor)
         labels.append(0 if scan.labels is None else int(np.bincount(scan.labels[members]).argmax()))
@@ -137,17 +138,19 @@ def _direction(points: FloatArray, velocity: FloatArray) -> float:
     """
     if np.linalg.norm(velocity[:2]) > _MIN_SPEED_M_S:
         return float(np.arctan2(velocity[1], velocity[0]))
-    best, longest, most = 0.0, True, -1.0
+    best = 0.0
+    longest = True
+    most = -1.0
     for angle in _ANGLES:
-        cos, sin = np.cos(angle), np.sin(angle)
+        cos = np.cos(angle)
+        sin = np.sin(angle)
         rectangle = points @ np.array([[cos, -sin], [sin, cos]])
-        lower, upper = rectangle.min(axis=0), rectangle.max(axis=0)
+        lower = rectangle.min(axis=0)
+        upper = rectangle.max(axis=0)
         to_side = np.minimum(rectangle - lower, upper - rectangle).min(axis=1)
         closeness = float((1 / np.maximum(to_side, _CLOSE_M)).sum())
         if closeness > most:
-            best, longest, most = (
-                float(angle),
-                bool(upper[0] - lower[0] >= upper[1] - lower[1]),
-                closeness,
-            )
+            best = float(angle)
+            longest = bool(upper[0] - lower[0] >= upper[1] - lower[1])
+            most = closeness
     return best if longest else best + float(np.pi / 2)

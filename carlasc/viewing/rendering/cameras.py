@@ -268,7 +268,8 @@ def perspective_camera(
         return Camera(position, _upright(target - position, axes), tan_y)
 
     side = 1.0 if axes == "left" else -1.0
-    azimuth, elevation = viewpoint.azimuth_rad, viewpoint.elevation_rad
+    azimuth = viewpoint.azimuth_rad
+    elevation = viewpoint.elevation_rad
     forward = np.array(
         [
             np.cos(azimuth) * np.cos(elevation),
@@ -292,7 +293,8 @@ def birdseye_camera(extent: Floats, aspect: float, *, axes: Axes = "left") -> Ca
     """Return an orthographic camera above the extent: x points up in the picture, the vehicle's
     right is on the right.
     """
-    lower, upper = extent.min(0), extent.max(0)
+    lower = extent.min(0)
+    upper = extent.max(0)
     size = np.maximum(upper - lower, 1e-3)
     rows = np.array(
         [[0.0, 1.0 if axes == "left" else -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
@@ -331,7 +333,8 @@ def _fit(
     shift| <= tan_y (distance + z): two lines per axis.
     """
     x, y, z = axes @ points.T
-    distances, shifts = [], []
+    distances = []
+    shifts = []
     for across, tangent in ((x, tan_x), (y, tan_y)):
         above = (across - tangent * z).max()
         below = (-across - tangent * z).max()

@@ -93,7 +93,8 @@ def scan_extent(scan: Scan) -> Extent:
     """Return the corners of a box that contains the sensor and most points, at most 40 m from the
     sensor.
     """
-    lower, upper = np.array([-5.0, -5.0, -2.0]), np.array([5.0, 5.0, 0.0])
+    lower = np.array([-5.0, -5.0, -2.0])
+    upper = np.array([5.0, 5.0, 0.0])
     if len(scan):
         lower, upper = (np.quantile(scan.points, share, axis=0) for share in (0.03, 0.97))
     side = np.array([5.0, 5.0, 0.0])  # the sensor and its surroundings are always in the picture
@@ -118,7 +119,8 @@ def grid_drawing(grid: Grid, colors: ClassColors, *, ego: bool = True) -> Drawin
     occupied = grid.labels > 0
     ids = np.flatnonzero(np.bincount(grid.labels.reshape(-1), minlength=1))
     if not colors.tell_shapes(ids):
-        low, high = grid.spec.lower[2], grid.spec.upper[2]
+        low = grid.spec.lower[2]
+        high = grid.spec.upper[2]
         layers = palette.height_colors(grid.spec.centers()[0, 0, :, 2], low, high)
         voxel_colors = np.broadcast_to(layers, (*grid.spec.size, 3))
         legend = palette.height_entries(low, high)
@@ -179,7 +181,8 @@ def scan_drawing(
         else np.flatnonzero(np.bincount(points.labels))
     )
     if points.labels is None or not colors.tell_shapes(ids):
-        low, high = float(extent[:, 2].min()), float(extent[:, 2].max())
+        low = float(extent[:, 2].min())
+        high = float(extent[:, 2].max())
         point_colors = palette.height_colors(points.points[:, 2], low, high)
         legend = palette.height_entries(low, high)
     else:
@@ -293,7 +296,8 @@ def check_color(color: GridColor, reader: SceneReader) -> None:
         return
     if "grid" not in reader.contents:
         raise ArgumentError("color", expected="class where no grid is shown", found=repr(color))
-    data, frames = reader.data, reader.frames
+    data = reader.data
+    frames = reader.frames
     evidence = EVIDENCE[color]
     field = f"{data.grid}/{evidence.part}"
     missing = sorted(set(frames) - data.frames_with(field))
@@ -356,7 +360,9 @@ _BOUNDS = (0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 _SHARES = [f"{low * 100:.0f} to {high:.0%}" for low, high in pairwise(_BOUNDS)]
 _SHARES = [f"up to {_BOUNDS[0]:.0%}", *_SHARES, f"over {_BOUNDS[-1]:.0%}"]
 _NUMBERS = ["1", "2 to 3", "4 to 7", "8 to 15", "16 to 31", "32 to 63", "64 and more"]
-_GREY, _BLUE, _ORANGE = (190, 196, 204), (0, 114, 178), (230, 110, 0)
+_GREY = (190, 196, 204)
+_BLUE = (0, 114, 178)
+_ORANGE = (230, 110, 0)
 _ORIGINS = [
     Entry("seen in this frame", _BLUE, 0),
     Entry("seen in other frames", _GREY, 1),
@@ -405,7 +411,8 @@ def evidence_drawing(
         MissingDataError: the frame lacks the field.
         FormatError: the grid does not have the format.
     """
-    grid, evidence = data.read_grid(frame), EVIDENCE[color]
+    grid = data.read_grid(frame)
+    evidence = EVIDENCE[color]
     colors = evidence.colors[evidence.classify(data.read_part(evidence.part, frame))]
     empty = "no voxel is occupied"
     return voxel_drawing(grid.spec, colors, grid.labels > 0, evidence.legend, empty, ego)

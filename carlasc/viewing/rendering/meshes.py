@@ -120,7 +120,8 @@ def grid_mesh(
     spec, occupied = split_arcs(whole, occupied)
     _, colors = split_arcs(whole, colors)
     pieces = spec.size[1] // whole.size[1]
-    solid, meshes = surrounded(spec, occupied), []
+    solid = surrounded(spec, occupied)
+    meshes = []
     for axis, side in SIDES:
         exposed = exposed_cells(spec, solid, axis, side, on_floor)
         meshes.append(_faces(spec, colors, solid, np.argwhere(exposed), axis, side, pieces))
@@ -210,7 +211,8 @@ def _faces(
     pieces: int,
 ) -> QuadMesh:
     """Return the faces of cells towards one side of one axis."""
-    across, along = (axis + 1) % 3, (axis + 2) % 3
+    across = (axis + 1) % 3
+    along = (axis + 2) % 3
     front = cells + 1
     front[:, axis] += 2 * side - 1
     openness = np.empty((len(cells), 4), np.float32)
@@ -221,10 +223,12 @@ def _faces(
         a, b, c = (solid[tuple(places.T)] for places in nearby)
         openness[:, number] = _OPENNESS[np.where(a & b, 3, a.astype(np.int64) + b + c)]
     # all edges are drawn except those between the flat pieces of one wide wedge
-    drawn, piece = np.ones((len(cells), 4), np.bool_), cells[:, 1] % pieces
+    drawn = np.ones((len(cells), 4), np.bool_)
+    piece = cells[:, 1] % pieces
     if pieces > 1 and axis != 1:  # edge 0: along low, 1: across high, 2: along high, 3: across low
         low, high = (3, 1) if across == 1 else (0, 2)
-        drawn[:, low], drawn[:, high] = piece == 0, piece == pieces - 1
+        drawn[:, low] = piece == 0
+        drawn[:, high] = piece == pieces - 1
     corners, normals = face_corners(spec, cells, cells, axis, side)
     return QuadMesh(
         corners.astype(np.float32),
@@ -281,12 +285,14 @@ def arrows(
     right /= np.linalg.norm(right, axis=1)[:, None]
     up = np.cross(right, forward)
     head = np.minimum(4.5 * width, 0.5 * lengths)
-    neck, tip = tails + vectors - head * forward, tails + vectors
+    neck = tails + vectors - head * forward
+    tip = tails + vectors
     angles = np.arange(7) * (np.pi / 3)
     faces = []
     for one, two in pairwise(angles):
         a, b = (np.cos(angle) * right + np.sin(angle) * up for angle in (one, two))
-        thin, thick = head / 9, head / 3
+        thin = head / 9
+        thick = head / 3
         faces += [
             (tails + thin * a, tails + thin * b, neck + thin * b, neck + thin * a),
             (neck + thick * a, neck + thick * b, tip, tip),

@@ -57,7 +57,8 @@ def overlay(
         FormatError: an image or the calibration is damaged, or the two do not match.
         ConflictError: `out` exists.
     """
-    started, scene = time.monotonic(), as_scene(source)
+    started = time.monotonic()
+    scene = as_scene(source)
     if not 0 <= opacity <= 1:
         raise ArgumentError("opacity", expected="0 to 1", found=opacity)
     check_target(out, STILLS + FILMS, overwrite)
@@ -74,7 +75,8 @@ def overlay(
     took = time.monotonic() - started
     path = reader.path
     table = reader.table.name
-    size, use = (width, height), reader.table_use
+    size = (width, height)
+    use = reader.table_use
     return RenderResult(
         out, path, ("grid",), frames, len(frames), size, table, took, reader.notes, None, use
     )
@@ -91,10 +93,8 @@ def _pictures(
     looks = camera.unproject(np.stack([columns, rows], axis=1))
     looks_somewhere = np.isfinite(looks).all(axis=1)
     for frame in frames:
-        place, grid = (
-            scan_T_camera(reader.data.sequence, camera, frame),
-            reader.data.read_grid(frame),
-        )
+        place = scan_T_camera(reader.data.sequence, camera, frame)
+        grid = reader.data.read_grid(frame)
         if place is None:
             where = f"{reader.path}: frame {frame}"
             advice = "choose other frames with `frames`"

@@ -20,7 +20,8 @@ from carlasc.errors import import_extra
 from carlasc.viewing.colors import Entry
 from carlasc.viewing.rendering.styles import check_size
 
-INK, FAINT = (40, 42, 48), (110, 114, 122)
+INK = (40, 42, 48)
+FAINT = (110, 114, 122)
 NO_SWATCH = (-1, -1, -1)
 """The colour of an entry that has a name only."""
 
@@ -99,9 +100,11 @@ def plan_page(
         room = area.width / columns - 2 * gap
         lines = max(len(wrap_text(text, font, room)) for text in captions)
         title_height = round(font_size * 0.4) + lines * line_height(font)
-    boxes, titles = [], []
+    boxes = []
+    titles = []
     for number in range(panels):
-        column, row = number % columns, number // columns
+        column = number % columns
+        row = number // columns
         left, right = (round(area.width * c / columns) for c in (column, column + 1))
         top, bottom = (round(area.height * r / rows) for r in (row, row + 1))
         if captions:  # all panels have the same size, so that their contents can be compared
@@ -147,7 +150,8 @@ def draw_page(
 
     for box, title in zip(page.titles, titles, strict=False):
         if wrapped:
-            top, line = box.y + round(font.size * 0.4), line_height(font)
+            top = box.y + round(font.size * 0.4)
+            line = line_height(font)
             for number, text in enumerate(wrap_text(title, font, box.width)):
                 write(box, top + (number + 0.5) * line, text, INK)
         else:
@@ -157,7 +161,8 @@ def draw_page(
             write(box, box.y + box.height / 2, shorten(note, font, box.width - 8), FAINT)
     swatch, gap = _swatch(font)
     for entry, box in zip(page.entries, page.entry_boxes, strict=True):
-        left, middle = box.x, box.y + box.height / 2
+        left = box.x
+        middle = box.y + box.height / 2
         if entry.color != NO_SWATCH:
             top = round(middle - swatch / 2)
             outline = tuple(round(value * 0.7) for value in entry.color)
@@ -181,7 +186,8 @@ def _place_legend(
     if not entries:
         return [], [], page
     columns, rows = _tiling(width, height, panels, aspect, wanted)
-    pad, line = font.size, line_height(font)
+    pad = font.size
+    line = line_height(font)
     widths = [entry_width(entry, font) for entry in entries]
     step = max(widths) + pad
 
@@ -202,7 +208,8 @@ def _place_legend(
             for i, width in enumerate(widths)
         ]
 
-    across, down = width // columns, height // rows
+    across = width // columns
+    down = height // rows
     last = Box(width - across, height - down, across, down)  # cell of the tiling
     if columns * rows > panels and columns_in(last.height) * step + pad <= last.width:
         return entries, placed_in(last), page
@@ -226,7 +233,8 @@ def _place_below(
     counts those left out.
     """
     width, height = size
-    pad, line = font.size, line_height(font)
+    pad = font.size
+    line = line_height(font)
     for room in range(len(entries), 0, -1):
         shown = entries
         if room < len(entries):
@@ -250,7 +258,8 @@ def _place_rows(
         top: upper edge of the first row.
         left_of: returns the left edge of a row of a length.
     """
-    placed, line = [], line_height(font)
+    placed = []
+    line = line_height(font)
     for number, row in enumerate(rows):
         x = left_of(sum(row) + font.size * (len(row) - 1))
         for width in row:
@@ -359,7 +368,8 @@ def draw_legend(entries: Sequence[Entry], font_size: int, most_width: int) -> Ui
     Returns:
         (height, width, 3) uint8 RGB.
     """
-    font, margin = font_of(font_size), max(2, font_size // 4)
+    font = font_of(font_size)
+    margin = max(2, font_size // 4)
     widths = [entry_width(entry, font) for entry in entries]
     rows = wrap_entries(widths, most_width - 2 * margin, font_size)
     placed = _place_rows(rows, font, margin, lambda _: margin)

@@ -98,7 +98,8 @@ class FrameRenderer:
 
     def panels(self, frame: int) -> list[Panel]:
         """Return the panels of a frame: each of the scene's contents from each of the views."""
-        contents, panels = self.reader.contents, []
+        contents = self.reader.contents
+        panels = []
         for content in contents:
             drawing = self.draw(content, frame)
             title = self.title(content) if len(contents) > 1 else ""
@@ -114,12 +115,14 @@ class FrameRenderer:
         if not self.boxes:
             return drawing
         boxes = boxes_in(self.reader.data, frame)
-        lower, upper = drawing.extent.min(axis=0), drawing.extent.max(axis=0)
+        lower = drawing.extent.min(axis=0)
+        upper = drawing.extent.max(axis=0)
         shown = ((boxes.centers >= lower) & (boxes.centers <= upper))[:, :2].all(axis=1)
         return with_boxes(drawing, boxes.select(shown))
 
     def _draw(self, content: str, frame: int) -> Drawing:
-        reader, colors = self.reader, self.reader.colors
+        reader = self.reader
+        colors = self.reader.colors
         if content in ("scan", "flow"):
             draw = scan_drawing if content == "scan" else flow_drawing
             return draw(reader.data.read_scan(frame), colors, extent=self.extent, ego=self.ego)
@@ -138,7 +141,8 @@ class FrameRenderer:
 
     def legend_of(self, frame: int) -> list[Entry]:
         """Return the entries that the legend of a frame needs."""
-        colors, legends = self.reader.colors, []
+        colors = self.reader.colors
+        legends = []
         for content in self.reader.contents:
             if content == "grid" and self.color != "class":
                 legends.append(EVIDENCE[self.color].legend)
@@ -175,7 +179,8 @@ class FrameRenderer:
     def title(self, content: str) -> str:
         """Return the title of one of the scene's contents."""
         titles = {"scan": "scan", "flow": "scene flow", "truth": "truth", "errors": "errors"}
-        data, truth = self.reader.data, self.reader.truth
+        data = self.reader.data
+        truth = self.reader.truth
         return titles.get(content) or (str(data.spec) if truth is None else "prediction")
 
 
@@ -195,7 +200,8 @@ def _swept_extent(extent: Extent) -> Extent:
     """Return the rims of the upright cylinder around an extent, which looks the same from every
     side.
     """
-    lower, upper = extent.min(0), extent.max(0)
+    lower = extent.min(0)
+    upper = extent.max(0)
     middle = (lower + upper) / 2
     radius = np.linalg.norm((extent - middle)[:, :2], axis=1).max()
     angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)

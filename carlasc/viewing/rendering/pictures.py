@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -125,34 +125,55 @@ def draw_panels(
     )
 
 
+@dataclass(frozen=True)
+class Look:
+    """How a picture of a grid or a scan looks.
+
+    Attributes:
+        view: "perspective" or "bev" (bird's-eye view).
+        viewpoint: where perspective views are taken from; None takes a point behind and above the
+            ego vehicle.
+        size: (width, height) of the whole picture, pixels.
+        palette: "class", "colorblind" or "height".
+        legend: whether there is a legend, of the classes that are shown.
+        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the
+            left).
+        ego: whether a plain car is drawn at the sensor.
+    """
+
+    view: View = "perspective"
+    viewpoint: Viewpoint | None = None
+    size: tuple[int, int] = DEFAULT_SIZE
+    palette: PaletteName = "class"
+    legend: bool = True
+    axes: Axes = "left"
+    ego: bool = True
+
+    def draw(self, drawings: Mapping[str, Drawing]) -> Uint8Array:
+        """Draw drawings side by side, by their titles."""
+        return draw_panels(
+            [Panel(drawing, self.view, title) for title, drawing in drawings.items()],
+            viewpoint=self.viewpoint,
+            size=self.size,
+            legend=self.legend,
+            axes=self.axes,
+        )
+
+
 def render_grid(
     grid: Grid,
     table: ClassTable = CARLA,
+    look: Look = Look(),
     *,
-    view: View = "perspective",
-    viewpoint: Viewpoint | None = None,
-    size: tuple[int, int] = DEFAULT_SIZE,
-    palette: PaletteName = "class",
-    legend: bool = True,
-    axes: Axes = "left",
     title: str = "",
-    ego: bool = True,
 ) -> Uint8Array:
     """Draw a voxel grid, without free and unknown voxels.
 
     Args:
         grid: Cartesian or cylindrical.
         table: class table of its labels.
-        view: "perspective" or "bev" (bird's-eye view).
-        viewpoint: where a perspective view is taken from; None takes a point behind and above the
-            ego vehicle.
-        size: (width, height), pixels.
-        palette: "class", "colorblind" or "height".
-        legend: whether there is a legend, of the classes in the grid.
-        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the
-            left).
+        look: how the picture looks.
         title: a line above the picture; "" for none.
-        ego: whether a plain car is drawn at the sensor.
 
     Returns:
         (height, width, 3) uint8 RGB.
@@ -162,24 +183,15 @@ def render_grid(
         ArgumentError: an impossible size, view, palette or value of `axes`.
         DependencyError: Pillow or Embree is not installed.
     """
-    drawing = grid_drawing(grid, ClassColors(table, palette), ego=ego)
-    return draw_panels(
-        [Panel(drawing, view, title)], viewpoint=viewpoint, size=size, legend=legend, axes=axes
-    )
+    return look.draw({title: grid_drawing(grid, ClassColors(table, look.palette), ego=look.ego)})
 
 
 def render_scan(
     scan: Scan,
     table: ClassTable = CARLA,
+    look: Look = Look(),
     *,
-    view: View = "perspective",
-    viewpoint: Viewpoint | None = None,
-    size: tuple[int, int] = DEFAULT_SIZE,
-    palette: PaletteName = "class",
-    legend: bool = True,
-    axes: Axes = "left",
     title: str = "",
-    ego: bool = True,
     flow: bool = False,
     extent: Extent | None = None,
 ) -> Uint8Array:
@@ -189,16 +201,8 @@ def render_scan(
     Args:
         scan: in the frame of the sensor.
         table: class table of its labels.
-        view: "perspective" or "bev" (bird's-eye view).
-        viewpoint: where a perspective view is taken from; None takes a point behind and above the
-            ego vehicle.
-        size: (width, height), pixels.
-        palette: "class", "colorblind" or "height".
-        legend: whether there is a legend.
-        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the
-            left).
+        look: how the picture looks.
         title: a line above the picture; "" for none.
-        ego: whether a plain car is drawn at the sensor.
         flow: draw static points in grey, moving ones in colour, with an arrow as long as the
             distance moved in one second.
         extent: (M, 3) points, metres, that the camera shows; None shows most of the scan.
@@ -212,25 +216,17 @@ def render_scan(
         DependencyError: Pillow or Embree is not installed.
     """
     draw = flow_drawing if flow else scan_drawing
-    drawing = draw(scan, ClassColors(table, palette), extent=extent, ego=ego)
-    return draw_panels(
-        [Panel(drawing, view, title)], viewpoint=viewpoint, size=size, legend=legend, axes=axes
-    )
+    colors = ClassColors(table, look.palette)
+    return look.draw({title: draw(scan, colors, extent=extent, ego=look.ego)})
 
 
 def render_comparison(
     prediction: Grid,
     truth: Grid,
     table: ClassTable = CARLA,
+    look: Look = Look(),
     *,
     errors: bool = True,
-    view: View = "perspective",
-    viewpoint: Viewpoint | None = None,
-    size: tuple[int, int] = DEFAULT_SIZE,
-    palette: PaletteName = "class",
-    legend: bool = True,
-    axes: Axes = "left",
-    ego: bool = True,
 ) -> Uint8Array:
     """Draw a prediction beside the ground truth and, with `errors`, its errors: right, wrong class,
     missed or invented.
@@ -239,16 +235,8 @@ def render_comparison(
         prediction: a grid with the geometry of the truth.
         truth: the ground truth; with counts, errors are shown only where it is known.
         table: class table of the labels of both grids.
+        look: how the picture looks.
         errors: whether a panel shows the errors.
-        view: "perspective" or "bev" (bird's-eye view).
-        viewpoint: where perspective views are taken from; None takes a point behind and above the
-            ego vehicle.
-        size: (width, height) of the whole picture, pixels.
-        palette: "class", "colorblind" or "height".
-        legend: whether there is a legend.
-        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the
-            left).
-        ego: whether a plain car is drawn at the sensor.
 
     Returns:
         (height, width, 3) uint8 RGB.
@@ -259,11 +247,11 @@ def render_comparison(
             value of `axes`.
         DependencyError: Pillow or Embree is not installed.
     """
-    colors = ClassColors(table, palette)
-    panels = [
-        Panel(grid_drawing(prediction, colors, ego=ego), view, "prediction"),
-        Panel(grid_drawing(truth, colors, ego=ego), view, "truth"),
-    ]
+    colors = ClassColors(table, look.palette)
+    drawings = {
+        "prediction": grid_drawing(prediction, colors, ego=look.ego),
+        "truth": grid_drawing(truth, colors, ego=look.ego),
+    }
     if errors:
-        panels.append(Panel(error_drawing(prediction, truth, ego=ego), view, "errors"))
-    return draw_panels(panels, viewpoint=viewpoint, size=size, legend=legend, axes=axes)
+        drawings["errors"] = error_drawing(prediction, truth, ego=look.ego)
+    return look.draw(drawings)

@@ -36,10 +36,8 @@ def visible_triangles(mesh: QuadMesh, camera: Camera, width: int, height: int) -
     nearness = np.full((height, width), -np.inf if camera.orthographic else 0.0, np.float32)
     corners = (mesh.corners.astype(np.float64) - camera.position) @ camera.axes.T
     step = camera.footprint(height)
-    x, y = (
-        (np.arange(width) + 0.5 - width / 2) * step,
-        (height / 2 - np.arange(height) - 0.5) * step,
-    )
+    x = (np.arange(width) + 0.5 - width / 2) * step
+    y = (height / 2 - np.arange(height) - 0.5) * step
     # seen from above, whole rows of samples are on edges of voxels: their rays begin at float32
     # numbers
     if camera.orthographic:
@@ -61,14 +59,13 @@ def _fill(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     `nearness` is 1 / depth for a pinhole camera, -depth for an orthographic one: both are linear.
     """
     height, width = seen.shape
-    middle_x, middle_y = width / 2 - 0.5, height / 2 - 0.5
+    middle_x = width / 2 - 0.5
+    middle_y = height / 2 - 0.5
     for quad in range(len(corners)):
         for half in range(2):
-            first, second, third = (
-                _point(corners[quad, 0]),
-                _point(corners[quad, 1 + half]),
-                _point(corners[quad, 2 + half]),
-            )
+            first = _point(corners[quad, 0])
+            second = _point(corners[quad, 1 + half])
+            third = _point(corners[quad, 2 + half])
             left, right, top, bottom = _bounds((first, second, third), flat)
             first_x = max(0, int(np.floor(max(left / step + middle_x, -1.0))))
             last_x = min(width - 1, int(np.ceil(min(right / step + middle_x, width))))
@@ -78,11 +75,9 @@ def _fill(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
                 continue
             depths = first[2], second[2], third[2]
             if flat:
-                first, second, third = (
-                    (first[0], first[1], 1.0),
-                    (second[0], second[1], 1.0),
-                    (third[0], third[1], 1.0),
-                )
+                first = (first[0], first[1], 1.0)
+                second = (second[0], second[1], 1.0)
+                third = (third[0], third[1], 1.0)
             ax, ay, az = _cross(second, third)
             bx, by, bz = _cross(third, first)
             cx, cy, cz = _cross(first, second)
@@ -124,23 +119,28 @@ def _bounds(points, flat):  # type: ignore[no-untyped-def]  # pragma: no cover (
     """Return left, right, top and bottom of the part of a triangle before the camera; left > right
     where there is none.
     """
-    left, right, top, bottom = np.inf, -np.inf, -np.inf, np.inf
+    left = np.inf
+    right = -np.inf
+    top = -np.inf
+    bottom = np.inf
     for corner in range(3):
         x, y, z = points[corner]
         if flat or z >= _NEAR_M:
             zoom = 1.0 if flat else 1 / z
-            left, right = min(left, x * zoom), max(right, x * zoom)
-            bottom, top = min(bottom, y * zoom), max(top, y * zoom)
+            left = min(left, x * zoom)
+            right = max(right, x * zoom)
+            bottom = min(bottom, y * zoom)
+            top = max(top, y * zoom)
         other_x, other_y, other_z = points[(corner + 1) % 3]
         # the edge crosses the plane in front of the camera
         if not flat and (z < _NEAR_M) != (other_z < _NEAR_M):
             share = (_NEAR_M - z) / (other_z - z)
-            cut_x, cut_y = (
-                (x + share * (other_x - x)) / _NEAR_M,
-                (y + share * (other_y - y)) / _NEAR_M,
-            )
-            left, right = min(left, cut_x), max(right, cut_x)
-            bottom, top = min(bottom, cut_y), max(top, cut_y)
+            cut_x = (x + share * (other_x - x)) / _NEAR_M
+            cut_y = (y + share * (other_y - y)) / _NEAR_M
+            left = min(left, cut_x)
+            right = max(right, cut_x)
+            bottom = min(bottom, cut_y)
+            top = max(top, cut_y)
     return left, right, top, bottom
 
 
@@ -171,31 +171,38 @@ def hits(corners: _Floats, triangle: Int32Array, origins: _Floats, directions: _
 def _write_hits(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     corners, triangle, origins, directions, weights
 ):
-    one, zero = np.float32(1), np.float32(0)
+    one = np.float32(1)
+    zero = np.float32(0)
     origin = edge_a = edge_b = edge_c = normal = (zero, zero, zero)
-    height, last = zero, -1
+    height = zero
+    last = -1
     for i in range(len(triangle)):
         if triangle[i] < 0:
             weights[2, i] = np.inf
             continue
-        start, ray = _point(origins[i]), _point(directions[i])
+        start = _point(origins[i])
+        ray = _point(directions[i])
         if triangle[i] != last or start != origin:
-            origin, last = start, triangle[i]
-            quad, half = last >> 1, last & 1
+            origin = start
+            last = triangle[i]
+            quad = last >> 1
+            half = last & 1
             a = _minus(_point(corners[quad, 0]), origin)
             b = _minus(_point(corners[quad, 1 + half]), origin)
             c = _minus(_point(corners[quad, 2 + half]), origin)
-            from_c, from_a, from_b = _minus(c, a), _minus(a, b), _minus(b, c)
-            edge_b, edge_c, edge_a = (
-                _cross32(from_c, _plus(c, a)),
-                _cross32(from_a, _plus(a, b)),
-                _cross32(from_b, _plus(b, c)),
-            )
+            from_c = _minus(c, a)
+            from_a = _minus(a, b)
+            from_b = _minus(b, c)
+            edge_b = _cross32(from_c, _plus(c, a))
+            edge_c = _cross32(from_a, _plus(a, b))
+            edge_a = _cross32(from_b, _plus(b, c))
             normal = _cross32(from_c, from_a)
             height = _dot(a, normal)
-        beside_b, beside_c = _dot(edge_b, ray), _dot(edge_c, ray)
+        beside_b = _dot(edge_b, ray)
+        beside_c = _dot(edge_c, ray)
         inverse = one / (beside_b + beside_c + _dot(edge_a, ray))
-        weights[0, i], weights[1, i] = min(beside_b * inverse, one), min(beside_c * inverse, one)
+        weights[0, i] = min(beside_b * inverse, one)
+        weights[1, i] = min(beside_c * inverse, one)
         weights[2, i] = height * (one / _dot(normal, ray))
 
 

@@ -176,7 +176,8 @@ def _aim_at_sun(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     for i in range(len(triangle)):
         if triangle[i] < 0:
             continue
-        q, s = triangle[i] >> 1, which[i]
+        q = triangle[i] >> 1
+        s = which[i]
         if normals[q, 0] * suns[s, 0] + normals[q, 1] * suns[s, 1] + normals[q, 2] * suns[s, 2] > 0:
             lift = np.float32(2e-3) + np.float32(2e-5) * depth[i]
             for a in range(3):
@@ -218,9 +219,11 @@ def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
         q = triangle[i] >> 1
         # position on the face: s from corner 0 to 1, t from corner 0 to 3
         if triangle[i] & 1 == 0:
-            s, t = u[i] + v[i], v[i]
+            s = u[i] + v[i]
+            t = v[i]
         else:
-            s, t = u[i], u[i] + v[i]
+            s = u[i]
+            t = u[i] + v[i]
         sun = which[i]
         low = openness[q, 0] * (1 - s) + openness[q, 1] * s
         high = openness[q, 3] * (1 - s) + openness[q, 2] * s
@@ -301,7 +304,8 @@ def _draw_balls(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
             for x in range(
                 max(0, int(columns[i] - radius)), min(width, int(columns[i] + radius) + 1)
             ):
-                dx, dy = x + 0.5 - columns[i], y + 0.5 - rows[i]
+                dx = x + 0.5 - columns[i]
+                dy = y + 0.5 - rows[i]
                 rim = (dx * dx + dy * dy) / (radius * radius)
                 if rim > 1 or depths[i] >= out_depth[y, x]:
                     continue

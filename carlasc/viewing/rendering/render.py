@@ -272,7 +272,8 @@ def _reported(
 
 def _name_after(reader: SceneReader, film: bool) -> Path:
     """Return a file name from the sequence, the contents and the frames."""
-    first, last = reader.frames[0], reader.frames[-1]
+    first = reader.frames[0]
+    last = reader.frames[-1]
     what = "" if reader.contents == ("grid",) else f"_{'_'.join(reader.contents)}"
     numbers = f"{first:06d}" if first == last else f"{first:06d}-{last:06d}"
     return Path(

@@ -12,15 +12,15 @@ from pathlib import Path
 from carlasc.core.choices import StyleName as StyleName  # noqa: PLC0414 (part of this module)
 from carlasc.errors import ArgumentError, check_choice, check_types
 
-SMALLEST, LARGEST = (64, 64), 16384  # pixels of a picture
+# pixels of a picture
+SMALLEST = (64, 64)
+LARGEST = 16384
 
 _SCREEN_SIZE = (1280, 720)
 # a column of two; the type of a caption
-_PAPER_SIZE, _PAPER_DPI, _PAPER_FONT_PT = (
-    "8.8cm x 5cm",
-    300.0,
-    8.0,
-)
+_PAPER_SIZE = "8.8cm x 5cm"
+_PAPER_DPI = 300.0
+_PAPER_FONT_PT = 8.0
 _INCHES = {"cm": 1 / 2.54, "mm": 1 / 25.4, "in": 1.0}
 _POINTS_PER_INCH = 72
 _LENGTH = r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*?)\s*"
@@ -70,7 +70,8 @@ class StyleOptions:
     @property
     def sheet(self) -> Sheet:
         """The sheet of a picture in this style."""
-        paper, dpi = self.name == "paper", self.dpi
+        paper = self.name == "paper"
+        dpi = self.dpi
         size = (_PAPER_SIZE if paper else _SCREEN_SIZE) if self.size is None else self.size
         if isinstance(size, str):
             lengths, with_unit = _read_lengths(size)
@@ -124,8 +125,11 @@ def _read_lengths(text: str) -> tuple[tuple[float, float], bool]:
     whether they have one.
     """
     if match := _SIZE.fullmatch(text.lower()):
-        width, height = float(match[1]), float(match[3])
-        first, second = match[2] or match[4], match[4]  # in 8.8x5cm, both are centimetres
+        width = float(match[1])
+        height = float(match[3])
+        # in 8.8x5cm, both are centimetres
+        first = match[2] or match[4]
+        second = match[4]
         if first == second == "":
             if width.is_integer() and height.is_integer():
                 return (width, height), False

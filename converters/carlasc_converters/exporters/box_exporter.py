@@ -4,6 +4,7 @@ of its field `boxes`, or those of a table.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, NamedTuple, Self
@@ -85,7 +86,8 @@ class Origin(NamedTuple):
                 the sensors are.
             FormatError: it has no frame at the time of one of the sequence.
         """
-        found, frames = _recordings(kind, place), sequence.scan_frames().tolist()
+        found = _recordings(kind, place)
+        frames = sequence.scan_frames().tolist()
         sensors = sequence.metadata.extra.get("sensors")
         if sequence.name not in found or not sensors:
             raise MissingDataError(
@@ -93,7 +95,8 @@ class Origin(NamedTuple):
                 expected=f"the recording from which {sequence.location} was converted",
                 found=", ".join(found),
             )
-        recording, own = found[sequence.name], sequence.times_of(frames)
+        recording = found[sequence.name]
+        own = sequence.times_of(frames)
         late = np.abs(np.asarray(recording.times()) - own[:, None])
         if late.min(axis=1).max() > _LATE_S:
             raise FormatError(
@@ -125,11 +128,11 @@ class FrameBoxes(NamedTuple):
     values: FloatArray
 
 
+@dataclass(eq=False)
 class BoxExporter(WholeFileExporter):
     """Writes the tracked boxes of each sequence to one file."""
 
-    def __init__(self, boxes: TableFile = None) -> None:
-        self.boxes = boxes
+    boxes: TableFile = None
 
     @property
     def of_one(self) -> str | None:
@@ -146,7 +149,8 @@ class BoxExporter(WholeFileExporter):
         if self.boxes is None and "boxes" not in sequence.fields():
             advice = "give a table of boxes with `boxes`"
             raise MissingDataError(sequence.location, expected="boxes", found="none", advice=advice)
-        numbers, notes = self.frames(sequence), list[str]()
+        numbers = self.frames(sequence)
+        notes = list[str]()
         times, poses, boxes = sequence_boxes(sequence, numbers)
         given = dict[int, FloatArray]()
         if self.boxes is not None:
@@ -159,6 +163,7 @@ class BoxExporter(WholeFileExporter):
         for number, own in boxes.items():
             found = np.insert(velocities_of(tracks, number, own), 3, 1.0, axis=1)
             known = given.get(number, found)
-            values, kept = np.where(np.isnan(known), found, known), np.flatnonzero(own.annotated)
+            values = np.where(np.isnan(known), found, known)
+            kept = np.flatnonzero(own.annotated)
             frames.append(FrameBoxes(number, pose_of[number], own.select(kept), values[kept]))
         return frames, notes

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -31,6 +32,7 @@ _MOSTLY = 0.5  # share of the occupied voxels above which structure without a cl
 _CARLASC_HEIGHT_M = 1.8  # docs/format.md#coordinate-frame
 
 
+@dataclass(eq=False)
 class GridExporter(FrameExporter):
     """Writes voxel grids of a given geometry, in classes of a given table.
 
@@ -49,8 +51,8 @@ class GridExporter(FrameExporter):
     free: ClassVar[int]
     slug: ClassVar[str]
 
-    def __init__(self, grid: GridName = None, *, predictions: Predictions = False) -> None:
-        self.grid, self.predictions = grid, predictions
+    grid: GridName = None
+    predictions: Predictions = field(default=False, kw_only=True)
 
     def frame_of(self, sequence: storage.Sequence) -> TargetFrame:
         """Return the frame of the grids that are written."""
@@ -60,7 +62,9 @@ class GridExporter(FrameExporter):
         """Return notes on what resampling loses; raise if the grid or the map of its classes does
         not exist.
         """
-        name, axes, frame = self.grid_of(sequence), sequence.metadata.axes, self.frame_of(sequence)
+        name = self.grid_of(sequence)
+        axes = sequence.metadata.axes
+        frame = self.frame_of(sequence)
         mapping_of(self.maps, self.kind, sequence.classes_of(name), f"{sequence.location}/{name}")
         if not self.predictions and f"{name}/counts" not in sequence.fields():
             raise MissingDataError(
@@ -88,7 +92,8 @@ class GridExporter(FrameExporter):
         """Return a note on the class of structure, if it has no class in the first frame, as in
         data with boxes only.
         """
-        table, frames = sequence.classes_of(name), sequence.frames(f"{name}/labels")
+        table = sequence.classes_of(name)
+        frames = sequence.frames(f"{name}/labels")
         if not len(frames):
             return []
         occupied = np.asarray(sequence.read(f"{name}/labels", int(frames[0])))
@@ -136,8 +141,11 @@ class GridExporter(FrameExporter):
 
     def read_codes(self, sequence: storage.Sequence, frame: int) -> tuple[LabelArray, BoolArray]:
         """Return the result of `read`, with 0 for free or unknown voxels, else class + 1."""
-        name, axes, place = self.grid_of(sequence), sequence.metadata.axes, self.frame_of(sequence)
-        grid, table = sequence.grid(name, frame), sequence.classes_of(name)
+        name = self.grid_of(sequence)
+        axes = sequence.metadata.axes
+        place = self.frame_of(sequence)
+        grid = sequence.grid(name, frame)
+        table = sequence.classes_of(name)
         where = f"{sequence.location}: {name} of frame {frame}"
         lookup = lookup_of(mapping_of(self.maps, self.kind, table, where))
         classes = classes_of(grid.labels, lookup, table, where)
@@ -259,7 +267,8 @@ def scan_occupancy(sequence: storage.Sequence, points: Float32Array, spec: GridS
     """
     occupancy = np.zeros(spec.num_voxels, np.bool_)
     distance = np.linalg.norm(points[:, :3].astype(np.float64), axis=1)
-    low, high = sequence.metadata.min_range_m or 0.0, sequence.metadata.max_range_m or np.inf
+    low = sequence.metadata.min_range_m or 0.0
+    high = sequence.metadata.max_range_m or np.inf
     index = spec.flat_index(points[(distance >= low) & (distance <= high), :3])
     occupancy[index[index >= 0]] = True
     return occupancy.reshape(spec.size)

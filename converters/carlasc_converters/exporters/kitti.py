@@ -60,7 +60,8 @@ TO_RAW: Mapping[str, Mapping[int, int]] = {
 }
 """Name of a class table -> id -> raw id of SemanticKITTI."""
 
-_FENCE, _BUILDING = 51, 50
+_FENCE = 51
+_BUILDING = 50
 UNSCORED: Mapping[int, int] = {1: 0, 52: _BUILDING, 99: _BUILDING}
 """Raw id that SemanticKITTI's evaluator does not accept in a prediction -> id that is written
 instead.
@@ -79,10 +80,8 @@ TO_PREDICTED: Mapping[str, Mapping[int, int]] = {
 """Name of a class table -> id -> raw id in a prediction: only ids that the evaluator scores, and 0.
 """
 # the ids of moving-object segmentation; unlabelled points and outliers stay 0
-_STANDS, _MOVES = (
-    9,
-    251,
-)
+_STANDS = 9
+_MOVES = 251
 _MOVING_M_S = 0.5  # points that are faster than this are moving
 _TO_MOVING = np.arange(max(SEMANTICKITTI.names) + 1)
 _TO_MOVING[list(SEMANTICKITTI.standing.values())] = list(SEMANTICKITTI.standing)
@@ -122,7 +121,9 @@ class KittiExporter(FrameExporter):
             if check is None:
                 raise ArgumentError("zip", expected="`check` too", found="only `zip`")
             check_archive(Path(zip))
-        self.grid, self.predictions, self.labels = grid, predictions, labels
+        self.grid = grid
+        self.predictions = predictions
+        self.labels = labels
         self.task: Task | None = check
         self.archive = zip
 
@@ -237,7 +238,8 @@ class KittiExporter(FrameExporter):
         """Return (N,) ids of SemanticKITTI: those of moving actors where the class or the flow of a
         point says that it moves.
         """
-        table, where = sequence.metadata.classes, f"{sequence.location}: labels of frame {frame}"
+        table = sequence.metadata.classes
+        where = f"{sequence.location}: labels of frame {frame}"
         labels = self._raw_ids(table, sequence.read("labels", frame), where)
         # without classes for moving actors
         if not table.moving and frame in sequence.frames("flow"):
@@ -262,7 +264,8 @@ class KittiExporter(FrameExporter):
         if kept:
             return {f"voxels/{name}": data for name, data in kept.items()}
         name = self._grid_of(sequence)
-        labels, counts = self._labels(sequence, frame), self._counts(sequence, frame)
+        labels = self._labels(sequence, frame)
+        counts = self._counts(sequence, frame)
         spec = sequence.grids[name]
         spec = spec if _is_right_handed(sequence) else mirror_spec(spec)
         files = {
@@ -336,10 +339,8 @@ def _instances(sequence: storage.Sequence, frame: int, count: int) -> Uint32Arra
     """
     if frame not in sequence.frames("instances"):
         return np.zeros(count, np.uint32)
-    instances, where = (
-        np.asarray(sequence.read("instances", frame), np.uint32),
-        f"{sequence.location}: instances of frame {frame}",
-    )
+    instances = np.asarray(sequence.read("instances", frame), np.uint32)
+    where = f"{sequence.location}: instances of frame {frame}"
     if len(instances) != count:
         raise FormatError(where, expected=f"{count} rows, as labels", found=len(instances))
     numbered = instances[instances > 0]
@@ -394,7 +395,8 @@ def calibration_of(
         made[name] = np.eye(4)
         if number in cameras:
             left_T_camera = left_T_lidar @ lidar_T_scan @ cameras[number].sensor_T_camera
-            matrix, moved = cameras[number].matrix, invert(left_T_camera)[:3, 3]
+            matrix = cameras[number].matrix
+            moved = invert(left_T_camera)[:3, 3]
             made[name] = np.column_stack([matrix, matrix @ moved])  # rectified: axes are the same
     return {**made, "Tr": left_T_lidar}
 

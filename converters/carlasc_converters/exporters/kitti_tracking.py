@@ -45,8 +45,10 @@ class KittiTrackingExporter(BoxExporter):
     def encode(self, sequence: storage.Sequence) -> tuple[bytes, list[str]]:
         """Return a line per box; and a note if the camera is assumed."""
         frames, notes = self.read(sequence)
-        cameras, table = cameras_by_number(sequence), sequence.metadata.classes
-        calibration, lines = calibration_of(sequence, _AHEAD_T_LIDAR), list[str]()
+        cameras = cameras_by_number(sequence)
+        table = sequence.metadata.classes
+        calibration = calibration_of(sequence, _AHEAD_T_LIDAR)
+        lines = list[str]()
         if not cameras:
             notes.append(
                 f"{sequence.location} has no camera image_00: boxes are in the frame of a camera "
@@ -82,7 +84,8 @@ def _places(boxes: Boxes, projection: FloatArray, camera: CameraModel | None) ->
     turned = (_GRID * boxes.sizes[:, None]) @ boxes.sensor_T_box[:, :3, :3].transpose(0, 2, 1)
     seen = (turned + boxes.centers[:, None]) @ projection[:, :3].T + projection[:, 3]
     seen[seen[:, :, 2] < _NEAREST_M] = np.nan
-    pixels, edge = seen[:, :, :2] / seen[:, :, 2:], (camera.width - 1, camera.height - 1)
+    pixels = seen[:, :, :2] / seen[:, :, 2:]
+    edge = (camera.width - 1, camera.height - 1)
     lower, upper = (np.clip(f.reduce(pixels, axis=1), 0, edge) for f in (np.fmin, np.fmax))
     inside = (upper > lower).all(axis=1, keepdims=True)
     return np.where(inside, np.hstack([lower, upper]), -1.0)

@@ -4,36 +4,33 @@ a recording: see the page `docs/commands/export.md#boxes`.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
 
 from carlasc import storage
 from carlasc.errors import ArgumentError
-from carlasc_converters.exporters.box_exporter import BoxExporter, Origin, TableFile
+from carlasc_converters.exporters.box_exporter import BoxExporter, Origin
 from carlasc_converters.ncore import Ncore, NcoreRecording
 from carlasc_converters.ncore_store import encode_store
 
 _COMPONENT = "cuboids/carlasc"  # beside the recording's own, cuboids/default
 
 
+@dataclass(eq=False)
 class NcoreExporter(BoxExporter):
     """Writes the observations of tracks as one more store of a recording."""
 
     title = "NCore: cuboid tracks, a store SEQUENCE.ncore4-carlasc.zarr"
 
-    def __init__(
-        self,
-        boxes: TableFile = None,
-        *,
-        recording: Annotated[
-            str, "Needed: store or folder of NCore from which the sequences were converted."
-        ] = "",
-    ) -> None:
-        if not recording:
+    recording: Annotated[
+        str, "Needed: store or folder of NCore from which the sequences were converted."
+    ] = field(default="", kw_only=True)
+
+    def __post_init__(self) -> None:
+        if not self.recording:
             raise ArgumentError("recording", expected="stores of NCore", found="none")
-        super().__init__(boxes)
-        self.recording = recording
 
     def file(self, sequence: storage.Sequence) -> str:
         """Return the metadata of the store, which has no other files."""
@@ -44,7 +41,8 @@ class NcoreExporter(BoxExporter):
         frames, notes = self.read(sequence)
         recording, numbers, rig_T_scan = Origin.of(sequence, Ncore, self.recording)
         assert isinstance(recording, NcoreRecording)
-        names, observations = sequence.metadata.classes.names, []
+        names = sequence.metadata.classes.names
+        observations = []
         for frame in frames:
             boxes = frame.boxes.transform(rig_T_scan)
             stamp = int(recording.ends_us[numbers[frame.number]])

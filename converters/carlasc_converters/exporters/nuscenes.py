@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,30 +14,24 @@ from carlasc import storage
 from carlasc.converting import Exported, Files
 from carlasc.core.geometry import invert, rotate_vectors
 from carlasc.storage.files import parse_json
-from carlasc_converters.exporters.box_exporter import BoxExporter, Origin, TableFile, names_of
+from carlasc_converters.exporters.box_exporter import BoxExporter, Origin, names_of
 from carlasc_converters.exporters.occ3d import frame_token
 from carlasc_converters.nuscenes import NuScenes, NuScenesScene
 
 _META = {f"use_{name}": name == "lidar" for name in ("camera", "lidar", "radar", "map", "external")}
 
 
+@dataclass(eq=False)
 class NuScenesExporter(BoxExporter):
     """Writes the results of each sequence, and those of each split."""
 
     title = "nuScenes' results of tracking and detection: SPLIT.json and SPLIT/SEQUENCE.json"
 
-    def __init__(
-        self,
-        boxes: TableFile = None,
-        *,
-        tables: Annotated[
-            str | None,
-            "nuScenes, from which the sequences were converted: tokens and the global frame are "
-            "those of its tables.",
-        ] = None,
-    ) -> None:
-        super().__init__(boxes)
-        self.tables = tables
+    tables: Annotated[
+        str | None,
+        "nuScenes, from which the sequences were converted: tokens and the global frame are those "
+        "of its tables.",
+    ] = field(default=None, kw_only=True)
 
     def file(self, sequence: storage.Sequence) -> str:
         """Return SPLIT/SEQUENCE.json."""
@@ -45,13 +40,15 @@ class NuScenesExporter(BoxExporter):
     def encode(self, sequence: storage.Sequence) -> tuple[bytes, list[str]]:
         """Return the results by sample; and a note on the classes that are left out."""
         frames, notes = self.read(sequence)
-        table, absent = sequence.metadata.classes, set[str]()
+        table = sequence.metadata.classes
+        absent = set[str]()
         tokens = {n: frame_token(sequence.name, n) for n in self.frames(sequence)}
         poses = {frame.number: frame.first_T_scan for frame in frames}
         if self.tables is not None:
             recording, numbers, vehicle_T_scan = Origin.of(sequence, NuScenes, self.tables)
             assert isinstance(recording, NuScenesScene)
-            known, times = recording.sample_tokens(), recording.times()
+            known = recording.sample_tokens()
+            times = recording.times()
             tokens = {n: known[own] for n, own in numbers.items() if own in known}
             for number in poses:
                 global_T_vehicle = recording.poses().at(times[numbers[number]])
@@ -60,7 +57,8 @@ class NuScenesExporter(BoxExporter):
         for frame in frames:
             if frame.number not in tokens:
                 continue
-            token, pose = tokens[frame.number], poses[frame.number]
+            token = tokens[frame.number]
+            pose = poses[frame.number]
             velocity = rotate_vectors(pose @ invert(frame.first_T_scan), frame.values[:, :3])
             boxes = frame.boxes.transform(pose)
             for row, label in enumerate(boxes.labels.tolist()):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from hashlib import blake2b
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,12 +25,7 @@ from carlasc.core.geometry import mirror_poses, quaternions_of, translation
 from carlasc.core.grids import GridSpec
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json
-from carlasc_converters.exporters.grid_exporter import (
-    GridExporter,
-    GridName,
-    Predictions,
-    sensor_height,
-)
+from carlasc_converters.exporters.grid_exporter import GridExporter, sensor_height
 
 _ANNOTATIONS = "annotations.json"
 _CAMERAS = "mask_camera is a copy of mask_lidar, because no cameras are known"
@@ -47,6 +43,7 @@ def frame_token(name: str, frame: int) -> str:
     return f"{blake2b(name.encode(), digest_size=13).hexdigest()}{frame:06d}"
 
 
+@dataclass(eq=False)
 class Occ3dExporter(GridExporter):
     """Writes grids as Occ3D-nuScenes has them: 200 x 200 x 16 voxels of 0.4 m around the vehicle,
     with the origin on the ground.
@@ -58,19 +55,10 @@ class Occ3dExporter(GridExporter):
     free = 17
     slug = "occ3d"
 
-    def __init__(
-        self,
-        grid: GridName = None,
-        *,
-        predictions: Predictions = False,
-        height_m: Annotated[
-            float | None,
-            "Height of the sensor above the ground, in metres. Default: that in carlasc.json, or "
-            "1.8.",
-        ] = None,
-    ) -> None:
-        super().__init__(grid, predictions=predictions)
-        self.height_m = height_m
+    height_m: Annotated[
+        float | None,
+        "Height of the sensor above the ground, in metres. Default: that in carlasc.json, or 1.8.",
+    ] = field(default=None, kw_only=True)
 
     def frame_of(self, sequence: storage.Sequence) -> TargetFrame:
         """Return the frame of the vehicle, whose origin is on the ground below the sensor."""
@@ -105,10 +93,8 @@ class Occ3dExporter(GridExporter):
         Without the field `seen`, voxels that the LiDAR observed count as observed by cameras.
         """
         labels, known = self.read(sequence, frame)
-        semantics, mask = (
-            np.where(known, labels, self.free).astype(np.uint8),
-            known.astype(np.uint8),
-        )
+        semantics = np.where(known, labels, self.free).astype(np.uint8)
+        mask = known.astype(np.uint8)
         seen = self._read_seen(sequence, frame) & mask if self._has_seen(sequence) else mask
         buffer = io.BytesIO()
         np.savez_compressed(buffer, semantics=semantics, mask_lidar=mask, mask_camera=seen)
@@ -119,7 +105,9 @@ class Occ3dExporter(GridExporter):
 
     def _read_seen(self, sequence: storage.Sequence, frame: int) -> Uint8Array:
         """Return (200, 200, 16) 1 for voxels that any camera sees."""
-        name, axes, place = self.grid_of(sequence), sequence.metadata.axes, self.frame_of(sequence)
+        name = self.grid_of(sequence)
+        axes = sequence.metadata.axes
+        place = self.frame_of(sequence)
         seen = place.turn((sequence.read(f"{name}/seen", frame) > 0).astype(np.uint8), axes)
         spec = place.spec_in(sequence.grids[name], axes)
         return resample_to(seen, np.ones(spec.size, np.bool_), spec, self.target)[0].astype(
@@ -147,7 +135,8 @@ class Occ3dExporter(GridExporter):
         return {_ANNOTATIONS: json.dumps(content, indent=1).encode()}
 
     def _scene(self, part: Exported) -> dict[str, Any]:
-        sequence, place = part.sequence, self.frame_of(part.sequence)
+        sequence = part.sequence
+        place = self.frame_of(part.sequence)
         tokens = ["", *(frame_token(sequence.name, frame) for frame in part.frames), ""]
         documents = sequence.documents()
         scene = {}

@@ -106,7 +106,8 @@ def _heights(lowest: int, count: int, rows: int, sensor: float) -> _Heights:
     faces = start[:, None] + np.where(up[:, None], np.arange(1, rows + 1), -np.arange(rows))
     voxel, step = np.nonzero((times < 1) & (faces >= 0) & (faces <= rows))
     order = np.argsort(times[voxel, step])
-    voxel, step = voxel[order], step[order]
+    voxel = voxel[order]
+    step = step[order]
     below = np.empty((len(order) + 1, rows + 1), np.uint32)
     below[0] = np.bitwise_or.reduce(
         np.where(start[:, None] < np.arange(rows + 1), bits[:, None], 0), axis=0
@@ -150,22 +151,30 @@ def _walk(
     width: int,
 ) -> np.uint32:
     """Return, as bits, the voxels of column (x, y) hidden from the sensor by an occupied one."""
-    rx, ry = sensor[0] - x - 0.5, sensor[1] - y - 0.5
-    sx, sy = (1 if rx > 0 else -1), (1 if ry > 0 else -1)
+    rx = sensor[0] - x - 0.5
+    ry = sensor[1] - y - 0.5
+    sx = 1 if rx > 0 else -1
+    sy = 1 if ry > 0 else -1
     # Per axis: the fraction of the way between two faces (d), and the fraction at which the next
     # face comes (t).
     dx = 1 / abs(rx) if rx != 0 else np.inf
     dy = 1 / abs(ry) if ry != 0 else np.inf
-    tx, ty = dx / 2, dy / 2
-    met, enter, stage = np.uint32(0), 0.0, 0  # stage: at `enter`, or -1
+    tx = dx / 2
+    ty = dy / 2
+    # stage: at `enter`, or -1
+    met = np.uint32(0)
+    enter = 0.0
+    stage = 0
     while True:
         leave = min(tx, ty)
-        first, last = columns.first[x * width + y], columns.first[x * width + y + 1]
+        first = columns.first[x * width + y]
+        last = columns.first[x * width + y + 1]
         if first < last:
             before = stage if stage >= 0 else _stage(heights, enter)
             stage = _stage(heights, leave)
             for i in range(first, last, 2):
-                low, high = columns.runs[i], columns.runs[i + 1]
+                low = columns.runs[i]
+                high = columns.runs[i + 1]
                 met |= heights.up & heights.below[before, high] & ~heights.below[stage, low]
                 met |= heights.down & ~heights.below[before, low] & heights.below[stage, high]
             if met == heights.up | heights.down:

@@ -11,7 +11,7 @@ import pickle
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -208,7 +208,8 @@ class OpenSceneFlowExporter(SequenceExporter):
             now, later = (_boxes(sequence, number) for number in (frame, following))
             (elapsed_s,) = np.diff(sequence.times_of([frame, following])).tolist()
             step = _Step(invert(_pose(sequence, following)) @ pose, elapsed_s)
-            seconds, instances = read.get("seconds"), read.get("instances")
+            seconds = read.get("seconds")
+            instances = read.get("instances")
             made |= step.flow(points, seconds, velocity, instances, now, later)
             near = (np.abs(points[:, :2]) <= _EVALUATED_M).all(axis=1)
             made["eval_mask"] = near & ~made["ground_mask"] & made["flow_is_valid"]
@@ -234,11 +235,11 @@ class OpenSceneFlowExporter(SequenceExporter):
         return {frame: str(_FIRST_NS + time) for frame, time in zip(frames, times, strict=True)}
 
 
-class _Step:
+class _Step(NamedTuple):
     """From a scan to the next one."""
 
-    def __init__(self, next_T_now: Transform, seconds: float) -> None:
-        self.next_T_now, self.seconds = next_T_now, seconds
+    next_T_now: Transform
+    seconds: float
 
     def flow(
         self,
@@ -269,7 +270,8 @@ class _Step:
         )
         if now is not None and later is not None:
             _, rows, next_rows = np.intersect1d(now.tracks, later.tracks, return_indices=True)
-            speeds, centers = np.zeros((len(now), 3)), later.centers[next_rows]
+            speeds = np.zeros((len(now), 3))
+            centers = later.centers[next_rows]
             here = transform_points(invert(self.next_T_now), centers)
             speeds[rows] = (here - now.centers[rows]) / self.seconds
             owners = _owners(now, points, seconds, speeds) if instances is None else instances
@@ -297,7 +299,9 @@ class _LogFile(SequenceFile):
 
     def __init__(self, path: Path, timestamps: Mapping[int, str]) -> None:
         self._file = import_extra("h5py", "hdf5").File(path, "w")
-        self._path, self._timestamps, self._numbers = path, timestamps, {0: 0}
+        self._path = path
+        self._timestamps = timestamps
+        self._numbers = {0: 0}
 
     def __enter__(self) -> Self:
         return self

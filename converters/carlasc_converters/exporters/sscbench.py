@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
@@ -17,8 +18,6 @@ from carlasc.core.tables import SEMANTICKITTI, SEMANTICKITTI19, SSCBENCH_TO_RAW
 from carlasc.errors import ArgumentError
 from carlasc_converters.exporters.grid_exporter import (
     GridExporter,
-    GridName,
-    Predictions,
     number_folders,
     read_points,
     scan_occupancy,
@@ -38,6 +37,7 @@ _RAW = {
 }
 
 
+@dataclass(eq=False)
 class SscBenchExporter(GridExporter):
     """Writes grids as SSCBench-KITTI-360 has them: 256 x 256 x 32 voxels of 0.2 m before the LiDAR,
     of every 5th frame.
@@ -50,17 +50,13 @@ class SscBenchExporter(GridExporter):
     free = 0
     slug = "sscbench"
 
-    def __init__(
-        self,
-        grid: GridName = None,
-        *,
-        predictions: Predictions = False,
-        every: Annotated[int, "Write only frames whose number is a multiple of this."] = 5,
-    ) -> None:
-        super().__init__(grid, predictions=predictions)
-        if every < 1:
-            raise ArgumentError("every", expected="1 or more", found=every)
-        self.every = every
+    every: Annotated[int, "Write only frames whose number is a multiple of this."] = field(
+        default=5, kw_only=True
+    )
+
+    def __post_init__(self) -> None:
+        if self.every < 1:
+            raise ArgumentError("every", expected="1 or more", found=self.every)
 
     @property
     def product(self) -> str:

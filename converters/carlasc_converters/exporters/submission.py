@@ -22,7 +22,9 @@ _INPUTS = {
     "completion": "voxels",
     "segmentation": "velodyne",
 }
-_BITS, _BYTES_PER_POINT = 8, 16  # of the inputs: voxels in a byte, and the size of a point
+# of the inputs: voxels in a byte, and the size of a point
+_BITS = 8
+_BYTES_PER_POINT = 16
 _DESCRIPTION = "description.txt"  # may lie beside sequences/
 
 
@@ -47,10 +49,8 @@ def check_submission(root: Path, dataset: Path, task: Task, ids: Collection[int]
     """
     wanted: list[Path] = []
     for number in SEQUENCES:
-        inputs, folder = (
-            dataset / f"sequences/{number}/{_INPUTS[task]}",
-            Path(f"sequences/{number}/predictions"),
-        )
+        inputs = dataset / f"sequences/{number}/{_INPUTS[task]}"
+        folder = Path(f"sequences/{number}/predictions")
         scans = {path.stem: path for path in sorted(inputs.glob("*.bin"))}
         if not scans:
             raise MissingDataError(
@@ -88,7 +88,8 @@ def check_submission(root: Path, dataset: Path, task: Task, ids: Collection[int]
 
 def _check_file(path: Path, scan: Path, task: Task, ids: Collection[int]) -> None:
     """Check the size of a file of predictions against its input, and its ids."""
-    size, actual = scan.stat().st_size, path.stat().st_size
+    size = scan.stat().st_size
+    actual = path.stat().st_size
     number, width = (size * _BITS, 2) if task == "completion" else (size // _BYTES_PER_POINT, 4)
     what = "voxels" if task == "completion" else "points"
     if actual != number * width:
@@ -116,10 +117,8 @@ def pack_submission(root: Path, files: Iterable[Path], archive: Path) -> None:
         StorageError: it cannot be written.
     """
     check_archive(archive)
-    files, part = (
-        [*files, *(Path(_DESCRIPTION) for _ in range((root / _DESCRIPTION).is_file()))],
-        unfinished(archive),
-    )
+    files = [*files, *(Path(_DESCRIPTION) for _ in range((root / _DESCRIPTION).is_file()))]
+    part = unfinished(archive)
     folders: Mapping[str, None] = dict.fromkeys(
         f"{parent.as_posix()}/"
         for file in files

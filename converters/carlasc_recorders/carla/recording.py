@@ -137,7 +137,8 @@ def record(
     images = photo_fields(models, CAMERA_KINDS)
     if bev or cameras:
         import_extra("PIL.Image", "carla")
-    writer, written = CaptureWriter(out), 0
+    writer = CaptureWriter(out)
+    written = 0
     with Server(server, carla) as connection:
         settings = _ServerSettings(town, traffic, sensors, seed, bev, connection.version, lidar)
         written_settings = dataclasses.asdict(settings) | (

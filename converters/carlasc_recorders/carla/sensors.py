@@ -29,7 +29,8 @@ CAMERA_KINDS = {
 }
 """The cameras of CARLA, by the folder of their images."""
 
-_FARTHEST_M, _DEPTH_STEP = 1000.0, 256.0
+_FARTHEST_M = 1000.0
+_DEPTH_STEP = 256.0
 
 RENUMBERED_FROM = (0, 9, 14)
 """First version of CARLA whose class ids differ from those of the data set."""
@@ -68,7 +69,9 @@ class SensorRig:
             MissingDataError: the server has no such sensor, or no room for it.
             ServerError: the server does not answer.
         """
-        self._server, self._lidar, self._seed = server, lidar, seed
+        self._server = server
+        self._lidar = lidar
+        self._seed = seed
         self._ego_id = int(ego.id)
         self._remap = (
             REMAPS["carla0914_to_carla"] if server.version_numbers >= RENUMBERED_FROM else None

@@ -75,7 +75,8 @@ class Server:
             ServerError: no server answers, or its version cannot be read.
         """
         self.carla = carla if carla is not None else import_extra("carla", "carla")
-        self.where, self.timeout_s = f"CARLA at {options.host}:{options.port}", options.timeout_s
+        self.where = f"CARLA at {options.host}:{options.port}"
+        self.timeout_s = options.timeout_s
         self._cleanup = ExitStack()
         self._client = self.carla.Client(options.host, options.port)
         self._client.set_timeout(options.timeout_s)
@@ -125,7 +126,8 @@ class Server:
             )
             self._world = self._client.load_world(town)
             settings = self._world.get_settings()
-            settings.synchronous_mode, settings.fixed_delta_seconds = True, FRAME_PERIOD_S
+            settings.synchronous_mode = True
+            settings.fixed_delta_seconds = FRAME_PERIOD_S
             settings.no_rendering_mode = False
             self._world.apply_settings(settings)
             self.initial_actors = tuple(sorted(int(actor.id) for actor in self._world.get_actors()))
@@ -275,7 +277,8 @@ class Server:
         def restore() -> None:
             world = self._client.get_world()
             settings = world.get_settings()
-            settings.synchronous_mode, settings.fixed_delta_seconds = synchronous, delta_s
+            settings.synchronous_mode = synchronous
+            settings.fixed_delta_seconds = delta_s
             settings.no_rendering_mode = no_rendering
             world.apply_settings(settings)
 

@@ -75,7 +75,8 @@ def draw_walks(rng: np.random.Generator, blocks: tuple[CityBlock, ...], count: i
     walks: list[Walk] = []
     occupied: dict[tuple[int, int], list[float]] = {}
     while len(walks) < count:
-        number, direction = int(rng.integers(len(blocks))), int(rng.integers(3))
+        number = int(rng.integers(len(blocks)))
+        direction = int(rng.integers(3))
         loop = close_loop(blocks[number].outline.at(HALF_ROAD_M + _OFFSETS_M[direction]))
         length = float(np.linalg.norm(np.diff(loop, axis=0), axis=1).sum())
         start = rng.uniform(0, length)
@@ -165,11 +166,13 @@ class Population:
         return actors
 
     def _pedestrians(self, frame: int) -> list[TownActor]:
-        elapsed_s, actors = frame * FRAME_PERIOD_S, []
+        elapsed_s = frame * FRAME_PERIOD_S
+        actors = []
         for id, (walk, height) in enumerate(
             zip(self._walks, self._heights, strict=True), EGO_ID + len(self._shapes)
         ):
-            pose, speed = walk.pose(elapsed_s, KERB_M), abs(walk.speed_mps)
+            pose = walk.pose(elapsed_s, KERB_M)
+            speed = abs(walk.speed_mps)
             cycle = (walk.start_m + speed * elapsed_s) / STRIDE_M
             phase = int(cycle * GAIT_PHASES) % GAIT_PHASES if speed else -1
             actors.append(
@@ -182,7 +185,8 @@ class Population:
 
 def _draw_vehicles(rng: np.random.Generator, count: int) -> tuple[list[Mesh], list[float]]:
     """Draw random moving vehicles, and return their meshes and lengths, the ego vehicle first."""
-    shapes, lengths = [vehicle_mesh(EGO_KIND)], [EGO_KIND.length_m]
+    shapes = [vehicle_mesh(EGO_KIND)]
+    lengths = [EGO_KIND.length_m]
     for _ in range(count):
         kind = _draw_kind(rng, VEHICLE_KINDS)
         if rng.random() < BICYCLE_SHARE:

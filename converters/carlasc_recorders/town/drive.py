@@ -98,7 +98,8 @@ class TownDrive:
             DependencyError: a package of the extra `simulate` is missing.
         """
         check_at_least(0, seed=seed)
-        self.seed, self.traffic = seed, traffic
+        self.seed = seed
+        self.traffic = traffic
         self.lidar = lidar if lidar is not None else Lidar()
         self.town: Town = build_town(self._random(_TOWN))
         self._population = Population(self._random(_POPULATION), self.town, traffic)
@@ -200,7 +201,8 @@ class TownDrive:
         """
         check_at_least(0, sensor=sensor)
         check_at_least(1, parts=parts)
-        now, offset = self.snapshot(frame), translation(self.sensor_offsets(sensor + 1)[sensor])
+        now = self.snapshot(frame)
+        offset = translation(self.sensor_offsets(sensor + 1)[sensor])
         directions = self.lidar.directions_of(frame)
         part_of = ((self.lidar.phases - phase) % 1.0 * parts).astype(np.int64)
         seconds = ((np.arange(parts) + 0.5) / parts - 0.5) * FRAME_PERIOD_S
@@ -208,7 +210,8 @@ class TownDrive:
         paths = self._paths(frame, seconds)
         static = [actor for id, actor in now.actors.items() if id not in paths]
         world = self._place(frame, now.world_T_ego, static)
-        pose, scans = now.world_T_ego @ offset, list[Scan]()
+        pose = now.world_T_ego @ offset
+        scans = list[Scan]()
         for part, after_s in enumerate(seconds.tolist()):
             moved = [
                 replace(now.actors[id], world_T_actor=path[part]) for id, path in paths.items()
@@ -232,7 +235,8 @@ class TownDrive:
         ego vehicle is the first.
         """
         frames = np.arange(max(frame - 1, 0), frame + 2)
-        poses, moving = defaultdict[int, list[Transform]](list), set[int]()
+        poses = defaultdict[int, list[Transform]](list)
+        moving = set[int]()
         for actor in (actor for near in frames.tolist() for actor in self._population.at(near)):
             poses[actor.id].append(actor.world_T_actor)
             if actor.id == EGO_ID or actor.velocity.any():
@@ -281,7 +285,8 @@ class TownDrive:
                 return False
         for actor in self.snapshot(frame).actors.values():
             local = transform_points(invert(actor.world_T_actor), point)
-            low, high = actor.mesh.vertices.min(axis=0) - 0.5, actor.mesh.vertices.max(axis=0) + 0.5
+            low = actor.mesh.vertices.min(axis=0) - 0.5
+            high = actor.mesh.vertices.max(axis=0) + 0.5
             if ((low < local) & (local < high)).all():
                 return False
         return True
@@ -315,7 +320,8 @@ class TownDrive:
             low, high = self._extents
             nearest = np.clip(ego[:2, 3], low, high) - ego[:2, 3]
             keep = (nearest**2).sum(axis=1) < reach**2
-            meshes, owners = [self.town.mesh.select(keep), *meshes], [0, *owners]
+            meshes = [self.town.mesh.select(keep), *meshes]
+            owners = [0, *owners]
         counts = [len(mesh.faces) for mesh in meshes]
         instances = np.repeat(np.array(owners, np.uint32), counts)
         mesh = concatenate(meshes)
@@ -375,7 +381,8 @@ def _scan(
     """
     found = cast(snapshots, world_T_sensor, directions, lidar, effects, luck)
     found = found.take((found.instances != EGO_ID) & (found.labels != 0))
-    distances, rays = found.distances * luck.scale[found.rays], found.rays
+    distances = found.distances * luck.scale[found.rays]
+    rays = found.rays
     points = (directions[rays] * distances[:, None] + luck.noise[rays]).astype(np.float32)
     labels = np.where(found.labels == NO_SURFACE, 0, found.labels).astype(np.uint32)
     return Scan(points, labels, None, found.instances)

@@ -18,9 +18,12 @@ from carlasc_recorders.town.plan import INNER_M, KERB_M, Rectangle, TownPlan
 from carlasc_recorders.town.streets import BAY_M, HALF_ROAD_M, Side, Streets
 
 FENCE, OTHER, POLE, WALL = (CARLA.id_of(name) for name in ("Fence", "Other", "Pole", "Wall"))
-TRAFFIC_SIGN, TRAFFIC_LIGHT = CARLA.id_of("TrafficSign"), CARLA.id_of("TrafficLight")
+TRAFFIC_SIGN = CARLA.id_of("TrafficSign")
+TRAFFIC_LIGHT = CARLA.id_of("TrafficLight")
 GUARD_RAIL, STATIC, DYNAMIC = (CARLA.id_of(name) for name in ("GuardRail", "Static", "Dynamic"))
-BRIDGE, RAIL_TRACK, GROUND = CARLA.id_of("Bridge"), CARLA.id_of("RailTrack"), CARLA.id_of("Ground")
+BRIDGE = CARLA.id_of("Bridge")
+RAIL_TRACK = CARLA.id_of("RailTrack")
+GROUND = CARLA.id_of("Ground")
 POST_DEPTH_M = 0.3  # depth of posts below the ground, which is not level
 
 
@@ -119,7 +122,8 @@ def trash(rng: np.random.Generator) -> Mesh:
     """Return a heap of trash bags and boxes, of CARLA's class Dynamic."""
     builder = MeshBuilder()
     for _ in range(rng.integers(2, 5)):
-        position, size = rng.uniform(-0.5, 0.5, 2), rng.uniform(0.3, 0.65, 3)
+        position = rng.uniform(-0.5, 0.5, 2)
+        size = rng.uniform(0.3, 0.65, 3)
         if rng.random() < 0.5:
             builder.cylinder(
                 DYNAMIC, (*position, 0), float(size[0]) / 2, float(size[2]), 7, top=0.5
@@ -197,7 +201,8 @@ def footbridge(span_m: float) -> Mesh:
     both ends.
     """
     builder = MeshBuilder()
-    half, deck = span_m / 2, 5.3
+    half = span_m / 2
+    deck = 5.3
     builder.boxes(BRIDGE, (0, 0, deck), (2.4, span_m, 0.35))
     for x in (-1.15, 1.15):
         builder.boxes(BRIDGE, (x, 0, deck + 0.35), (0.08, span_m, 1.1))
@@ -259,10 +264,7 @@ def mark_parking_bay(plan: TownPlan, side: Side) -> None:
     if not side.has_bay:
         return
     for at in np.arange(6.0, side.length_m - 6.0, 6.4):
-        pose = translation((*side.point(at, HALF_ROAD_M + BAY_M / 2 - 0.05), 0.0)) @ rotation_z(
-            side.yaw_rad
-        )
-        plan.parking.append(pose)
+        plan.park(side.point(at, HALF_ROAD_M + BAY_M / 2 - 0.05), side.yaw_rad, 0.0)
 
 
 def add_traffic_signals(plan: TownPlan, streets: Streets) -> None:
@@ -370,7 +372,8 @@ def _add_facades(
     ):
         columns = max(int((length - 1.0) // pitch), 1)
         x, z = np.meshgrid((np.arange(columns) - (columns - 1) / 2) * pitch, floors + 0.9)
-        x, z = x.ravel(), z.ravel()
+        x = x.ravel()
+        z = z.ravel()
         out = np.full_like(x, -reach / 2)
         frame = MeshBuilder()
         frame.boxes(BUILDING, np.column_stack([x, out - 0.06, z - 0.1]), (1.5, 0.24, 0.1))
@@ -408,7 +411,8 @@ def _add_flat_roof(
 def _add_pitched_roof(
     builder: MeshBuilder, rng: np.random.Generator, width: float, depth: float, height: float
 ) -> None:
-    eaves, rise = 0.45, depth / 2 * rng.uniform(0.5, 0.9)
+    eaves = 0.45
+    rise = depth / 2 * rng.uniform(0.5, 0.9)
     roof = np.array([(-width / 2 - eaves, height - 0.15), (width / 2 + eaves, height - 0.15)])
     x = np.array([roof[0, 0], roof[1, 0], roof[1, 0], roof[0, 0], roof[0, 0], roof[1, 0]])
     y = np.array(

@@ -67,7 +67,8 @@ class MeshBuilder:
             vertices: (V, 3) metres.
             faces: (F, 3) rows of `vertices`.
         """
-        corners, rows = np.asarray(vertices, np.float64), np.asarray(faces, np.int32)
+        corners = np.asarray(vertices, np.float64)
+        rows = np.asarray(faces, np.int32)
         self._parts.append(Mesh(corners, rows, np.full(len(rows), label, np.uint8)))
 
     def add_mesh(self, mesh: Mesh, dst_T_src: Transform) -> None:
@@ -85,16 +86,7 @@ class MeshBuilder:
             size: (3,) or (N, 3) lengths along x, y and z of each box, metres.
             yaw_rad: () or (N,) rotations about z.
         """
-        base, size = np.array(base, np.float64, ndmin=2), np.array(size, np.float64, ndmin=2)
-        count = max(len(base), len(size))
-        corners, faces = _unit_box()
-        local = corners * np.broadcast_to(size, (count, 3))[:, None, :]
-        moved = (
-            _rotate_z(local, np.broadcast_to(np.asarray(yaw_rad, np.float64), (count,)))
-            + base[:, None, :]
-        )
-        offsets = np.arange(count, dtype=np.int32)[:, None, None] * np.int32(len(corners))
-        self.add(label, moved.reshape(-1, 3), (faces + offsets).reshape(-1, 3))
+        self._copies(label, _unit_box(), base, np.array(size, np.float64, ndmin=2), yaw_rad)
 
     def level_rectangles(
         self, label: int, centre: ArrayLike, size: ArrayLike, yaw_rad: float = 0.0
@@ -107,14 +99,28 @@ class MeshBuilder:
             size: (2,) or (N, 2) lengths along x and y of each rectangle, metres.
             yaw_rad: rotation about z.
         """
-        centre, size = np.array(centre, np.float64, ndmin=2), np.array(size, np.float64, ndmin=2)
         corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
-        local = corners * at_height(np.broadcast_to(size, (len(centre), 2)), 1.0)[:, None, :]
-        moved = _rotate_z(local, np.full(len(centre), yaw_rad)) + centre[:, None, :]
-        first = np.arange(len(centre), dtype=np.int32)[:, None, None] * np.int32(4)
-        self.add(
-            label, moved.reshape(-1, 3), (np.array([[0, 1, 2], [0, 2, 3]]) + first).reshape(-1, 3)
-        )
+        square = corners, np.array([[0, 1, 2], [0, 2, 3]])
+        sizes = at_height(np.array(size, np.float64, ndmin=2), 1.0)
+        self._copies(label, square, centre, sizes, yaw_rad)
+
+    def _copies(
+        self,
+        label: int,
+        shape: tuple[Vertices, IntArray],
+        place: ArrayLike,
+        sizes: FloatArray,
+        yaw_rad: ArrayLike,
+    ) -> None:
+        """Add copies of a shape of size 1: its corners and faces."""
+        corners, faces = shape
+        places = np.array(place, np.float64, ndmin=2)
+        count = max(len(places), len(sizes))
+        local = corners * np.broadcast_to(sizes, (count, 3))[:, None, :]
+        turns = np.broadcast_to(np.asarray(yaw_rad, np.float64), (count,))
+        moved = _rotate_z(local, turns) + places[:, None, :]
+        first = np.arange(count, dtype=np.int32)[:, None, None] * np.int32(len(corners))
+        self.add(label, moved.reshape(-1, 3), (faces + first).reshape(-1, 3))
 
     def cylinder(
         self,
@@ -152,7 +158,8 @@ class MeshBuilder:
             radius: metres.
             sections: number of flat faces around it.
         """
-        start, end = np.asarray(start, np.float64), np.asarray(end, np.float64)
+        start = np.asarray(start, np.float64)
+        end = np.asarray(end, np.float64)
         length = float(np.linalg.norm(end - start))
         along = (end - start) / length
         side = np.cross(along, (1.0, 0.0, 0.0) if abs(along[0]) < 0.9 else (0.0, 1.0, 0.0))
@@ -163,9 +170,13 @@ class MeshBuilder:
 
     def ribbon(self, label: int, left: ArrayLike, right: ArrayLike) -> None:
         """Add the strip between two polylines, (P, 3) each, metres."""
-        left, right = np.asarray(left, np.float64), np.asarray(right, np.float64)
+        left = np.asarray(left, np.float64)
+        right = np.asarray(right, np.float64)
         first = np.arange(len(left) - 1)
-        a, b, c, d = first, first + 1, first + len(left), first + len(left) + 1
+        a = first
+        b = first + 1
+        c = first + len(left)
+        d = first + len(left) + 1
         faces = np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)])
         self.add(label, np.concatenate([left, right]), faces)
 
@@ -233,8 +244,11 @@ def unit_sphere(subdivisions: int = 1) -> tuple[Vertices, IntArray]:
 
 def _rotate_z(points: FloatArray, yaw_rad: FloatArray) -> FloatArray:
     """Rotate points (N, P, 3) about z, x towards y, by (N,) angles."""
-    cos, sin = np.cos(yaw_rad)[:, None], np.sin(yaw_rad)[:, None]
-    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    cos = np.cos(yaw_rad)[:, None]
+    sin = np.sin(yaw_rad)[:, None]
+    x = points[..., 0]
+    y = points[..., 1]
+    z = points[..., 2]
     return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1)
 
 

@@ -41,9 +41,13 @@ IMAGE_SIZE = (800, 450)
 
 # horizontal field of view; position of a camera relative to the ego sensor: ahead in its viewing
 # direction, and below
-_FIELD_DEG, _AHEAD_M, _BELOW_M = 70.0, 0.4, 0.15
-_RANGE_M, _DEPTH_STEP = 255.0, 256.0
-_SKY, _SKY_LABEL = (196, 216, 235), 13
+_FIELD_DEG = 70.0
+_AHEAD_M = 0.4
+_BELOW_M = 0.15
+_RANGE_M = 255.0
+_DEPTH_STEP = 256.0
+_SKY = (196, 216, 235)
+_SKY_LABEL = 13
 _SUN = np.array([0.35, -0.45, 0.82])  # direction towards the sun
 PHOTO_SUFFIXES = MappingProxyType(
     {"images": "jpg", "image_labels": "png", "image_instances": "png", "image_depths": "png"}
@@ -102,7 +106,8 @@ def photograph(
         DependencyError: a package of the extra `simulate` is missing.
     """
     others = snapshot.instances != EGO_ID
-    mesh, instances = snapshot.mesh.select(others), snapshot.instances[others]
+    mesh = snapshot.mesh.select(others)
+    instances = snapshot.instances[others]
     scene = RayScene(mesh, snapshot.world_T_ego[:3, 3])
     files: dict[str, Uint8Array] = {}
     for camera in cameras:
@@ -111,14 +116,16 @@ def photograph(
         looks = camera.unproject(np.stack([columns, rows], axis=1))
         rays = rotate_exactly(world_T_camera, looks)
         hit, triangles, distances = scene.cast(world_T_camera[:3, 3], rays, _RANGE_M)
-        shape, labels = (camera.height, camera.width), mesh.labels[triangles]
+        shape = (camera.height, camera.width)
+        labels = mesh.labels[triangles]
         color = np.tile(np.array(_SKY, np.uint8), (len(rays), 1))
         color[hit] = shaded_colors(scene, triangles, labels, rays[hit])
         classes, actors, depths = (
             np.full(len(rays), _SKY_LABEL, np.uint8),
             *np.zeros((2, len(rays)), np.uint16),
         )
-        classes[hit], actors[hit] = labels, instances[triangles]
+        classes[hit] = labels
+        actors[hit] = instances[triangles]
         depths[hit] = np.rint(distances * looks[hit, 2] * _DEPTH_STEP).clip(1, 65535)
         layers: tuple[LabelArray, ...] = (
             color.reshape(*shape, 3),

@@ -55,7 +55,8 @@ def broadleaf(rng: np.random.Generator) -> Mesh:
     """Return a tree, 5 to 10 m high, whose crown consists of several ellipsoids."""
     builder = MeshBuilder()
     height = rng.uniform(5.0, 10.0)
-    clear, radius = height * rng.uniform(0.28, 0.4), height * rng.uniform(0.2, 0.3)
+    clear = height * rng.uniform(0.28, 0.4)
+    radius = height * rng.uniform(0.2, 0.3)
     trunk = rng.uniform(0.1, 0.22)
     builder.cylinder(VEGETATION, (0, 0, -0.3), trunk, height * 0.6 + 0.3, 8, top=0.6)
     for _ in range(rng.integers(4, 8)):
@@ -86,7 +87,8 @@ def broadleaf(rng: np.random.Generator) -> Mesh:
 def conifer(rng: np.random.Generator) -> Mesh:
     """Return a tree, 6 to 12 m high, that narrows towards its top."""
     builder = MeshBuilder()
-    height, radius = rng.uniform(6.0, 12.0), rng.uniform(1.2, 2.0)
+    height = rng.uniform(6.0, 12.0)
+    radius = rng.uniform(1.2, 2.0)
     builder.cylinder(VEGETATION, (0, 0, -0.3), 0.16, height * 0.9, 7, top=0.4)
     for level in np.linspace(1.0, height - 0.6, int(height / 0.7)):
         reach = radius * (1.05 - level / height)
@@ -181,7 +183,8 @@ class Rectangle:
     @cached_property
     def axes(self) -> Points:
         """(2, 2) unit vectors of x and y of the rectangle, one per row."""
-        cos, sin = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        cos = np.cos(self.yaw_rad)
+        sin = np.sin(self.yaw_rad)
         return np.array([[cos, sin], [-sin, cos]])
 
     def local(self, points: Points) -> Points:
@@ -211,7 +214,8 @@ class Rectangle:
         if math.hypot(x - other_x, y - other_y) > radius + other_radius + margin_m:
             return False
         axes = np.concatenate([self.axes, other.axes])
-        a, b = self.corners @ axes.T, other.corners @ axes.T
+        a = self.corners @ axes.T
+        b = other.corners @ axes.T
         apart = (a.max(axis=0) + margin_m <= b.min(axis=0)) | (
             b.max(axis=0) + margin_m <= a.min(axis=0)
         )
@@ -230,15 +234,24 @@ class Land:
     boundary: Points
     occupied: list[Rectangle] = field(default_factory=list)
 
+    def draw(self, rng: np.random.Generator) -> Points:
+        """Return a random position, (2,), in the box around the land."""
+        low = self.boundary.min(axis=0)
+        return low + rng.uniform(0, 1, 2) * np.ptp(self.boundary, axis=0)
+
     def inside(self, points: Points, margin_m: float = 0.0) -> bool:
         """Whether all points (N, 2) are inside the boundary, and at least a margin away from it."""
         (start_x, start_y), (end_x, end_y) = self.boundary.T, np.roll(self.boundary, -1, axis=0).T
-        along_x, along_y, x, y = end_x - start_x, end_y - start_y, points[:, :1], points[:, 1:]
+        along_x = end_x - start_x
+        along_y = end_y - start_y
+        x = points[:, :1]
+        y = points[:, 1:]
         share = ((x - start_x) * along_x + (y - start_y) * along_y) / np.maximum(
             along_x**2 + along_y**2, 1e-12
         )
         share = np.clip(share, 0, 1)
-        beside_x, beside_y = x - (start_x + share * along_x), y - (start_y + share * along_y)
+        beside_x = x - (start_x + share * along_x)
+        beside_y = y - (start_y + share * along_y)
         far_enough = np.sqrt(beside_x**2 + beside_y**2).min(axis=1) >= margin_m
         # From a point inside, a ray along +x crosses the boundary an odd number of times.
         crossed = (start_y > y) != (end_y > y)
@@ -291,6 +304,10 @@ class TownPlan:
     builder: MeshBuilder = field(default_factory=MeshBuilder)
     buildings: list[tuple[Rectangle, float]] = field(default_factory=list)
     parking: list[Transform] = field(default_factory=list)
+
+    def park(self, position: FloatArray, yaw_rad: float, height_m: float) -> None:
+        """Add a place for a parked vehicle."""
+        self.parking.append(translation((*position, height_m)) @ rotation_z(yaw_rad))
 
     def add(
         self, mesh: Mesh, position: FloatArray, yaw_rad: float, height_m: float = KERB_M

@@ -60,7 +60,9 @@ class Luck(NamedTuple):
         """Draw it for all rays of a LiDAR."""
         rays = len(lidar.directions)
         noise = rng.uniform(-lidar.noise_m, lidar.noise_m, (rays, 3))
-        scale, drop, none = np.ones(rays), np.full(rays, np.inf), np.zeros(rays, np.bool_)
+        scale = np.ones(rays)
+        drop = np.full(rays, np.inf)
+        none = np.zeros(rays, np.bool_)
         if effects == LidarEffects():
             return cls(noise, scale, none, drop, none)
         scale += effects.range_noise * rng.standard_normal(rays)
@@ -105,7 +107,8 @@ def cast(
     luck: Luck,
 ) -> Returns:
     """Return the returns of (R, 3) rays in the frame of a sensor."""
-    rays, origin = rotate_exactly(world_T_sensor, directions), world_T_sensor[:3, 3]
+    rays = rotate_exactly(world_T_sensor, directions)
+    origin = world_T_sensor[:3, 3]
     found = _nearest(seen, origin, rays, lidar.range_m, normals=effects.reflections > 0)
     if effects.reflections:
         found = _mirrored(seen, found, origin, rays, lidar.range_m, luck.mirrored)
@@ -133,7 +136,8 @@ def _nearest(
     for part in seen:
         hit, triangles, distances = part.scene.cast(origins, rays, range_m)
         of_surfaces = part.scene.normals(triangles) if normals else np.empty((len(hit), 0))
-        labels, instances = part.mesh.labels[triangles], part.instances[triangles]
+        labels = part.mesh.labels[triangles]
+        instances = part.instances[triangles]
         parts.append(Returns(hit, distances, labels, instances, of_surfaces))
     if len(parts) == 1:
         return parts[0]
@@ -168,7 +172,8 @@ def _mirrored(
     """Move the returns of mirrors to behind them, as far as what is seen in them is away."""
     found, normals = found._replace(normals=np.empty((len(found.rays), 0))), found.normals
     rows = np.flatnonzero(mirrored[found.rays] & np.isin(found.labels, _MIRRORS))
-    at, normal = found.take(rows), normals[rows]
+    at = found.take(rows)
+    normal = normals[rows]
     incoming = rays[at.rays]
     outgoing = incoming - 2 * (incoming * normal).sum(axis=1, keepdims=True) * normal
     # a little off the surface, which would be met again

@@ -134,7 +134,8 @@ def vehicle_mesh(kind: VehicleKind) -> Mesh:
     body = np.array(kind.body) * stretch - middle
     builder.prism(VEHICLE, body, -half, half)
     cabin = np.array(kind.cabin) * stretch - middle
-    low, high = cabin[:, 1].min(), cabin[:, 1].max()
+    low = cabin[:, 1].min()
+    high = cabin[:, 1].max()
     sides = half - 0.04 - kind.cabin_taper * (cabin[:, 1] - low) / (high - low)
     builder.prism(VEHICLE, cabin, -sides, sides)
     if kind.name == "truck":  # the cab is separate from the box
@@ -190,10 +191,8 @@ def pedestrian_mesh(height_m: float, phase: int) -> Mesh:
         builder.rod(PEDESTRIAN, hip, knee, 0.085)
         builder.rod(PEDESTRIAN, knee, foot, 0.06)
         builder.boxes(PEDESTRIAN, foot + (0.06, 0, -0.06), (0.27, 0.1, 0.09))
-        shoulder, hand = (
-            np.array([0.0, side * 0.21, 1.42]),
-            np.array([-side * swing * 0.7, side * 0.27, 0.82]),
-        )
+        shoulder = np.array([0.0, side * 0.21, 1.42])
+        hand = np.array([-side * swing * 0.7, side * 0.27, 0.82])
         builder.rod(PEDESTRIAN, shoulder, hand, 0.05)
     torso = np.array(
         ((-0.11, 0.85), (0.11, 0.85), (0.13, 1.2), (0.09, 1.48), (-0.1, 1.48), (-0.13, 1.2))

@@ -43,7 +43,8 @@ def render_birdseye(snapshot: Snapshot) -> bytes:
         DependencyError: a package of the extra `simulate` is missing.
     """
     image = import_extra("PIL.Image", "simulate")
-    directions, world_T_ego = _downward_rays(), snapshot.world_T_ego
+    directions = _downward_rays()
+    world_T_ego = snapshot.world_T_ego
     rays = rotate_vectors(world_T_ego, directions.reshape(-1, 3))
     eye = world_T_ego[:3, :3] @ np.array((0.0, 0.0, BEV_HEIGHT_M)) + world_T_ego[:3, 3]
     hit, triangles, _ = snapshot.scene.cast(eye, rays, 1000.0)
@@ -61,7 +62,8 @@ def _downward_rays() -> FloatArray:
 
     Its upper edge is ahead, its right edge on the right.
     """
-    width, height = BEV_SIZE[0] // _REDUCTION, BEV_SIZE[1] // _REDUCTION
+    width = BEV_SIZE[0] // _REDUCTION
+    height = BEV_SIZE[1] // _REDUCTION
     right = (np.arange(width) + 0.5 - width / 2) / (width / 2)
     ahead = -(np.arange(height) + 0.5 - height / 2) / (width / 2)
     rays = np.stack(np.broadcast_arrays(ahead[:, None], right[None, :], -1.0), axis=-1)

@@ -138,7 +138,8 @@ class Lane:
     @cached_property
     def turning_rad(self) -> float:
         """Absolute change of the heading from start to end."""
-        first, last = self.path[1] - self.path[0], self.path[-1] - self.path[-2]
+        first = self.path[1] - self.path[0]
+        last = self.path[-1] - self.path[-2]
         cosine = first @ last / (np.linalg.norm(first) * np.linalg.norm(last))
         return float(np.arccos(np.clip(cosine, -1, 1)))
 
@@ -225,7 +226,8 @@ def _trace_faces(nodes: Points, edges: IntArray) -> list[list[int]]:
     for first in sorted(unused):
         if first not in unused:
             continue
-        loop, step = [], first
+        loop = []
+        step = first
         while step in unused:
             unused.remove(step)
             loop.append(step[0])
@@ -235,10 +237,14 @@ def _trace_faces(nodes: Points, edges: IntArray) -> list[list[int]]:
     return loops
 
 
+def _unit(direction: Points) -> Points:
+    return direction / np.linalg.norm(direction)
+
+
 def _corner(nodes: Points, before: int, node: int, after: int) -> tuple[Points, Points, float]:
     """Return the directions into and out of a corner, and its turn to the right in radians."""
-    arriving, leaving = nodes[node] - nodes[before], nodes[after] - nodes[node]
-    arriving, leaving = arriving / np.linalg.norm(arriving), leaving / np.linalg.norm(leaving)
+    arriving = _unit(nodes[node] - nodes[before])
+    leaving = _unit(nodes[after] - nodes[node])
     turn = np.arctan2(arriving[0] * leaving[1] - arriving[1] * leaving[0], arriving @ leaving)
     return arriving, leaving, float(turn)
 
@@ -272,13 +278,16 @@ def _make_block(
     corners = nodes[loop]
     following = np.roll(corners, -1, axis=0)
     outside = float((corners[:, 0] * following[:, 1] - corners[:, 1] * following[:, 0]).sum()) < 0
-    anchors, normals, sides = [], [], []
+    anchors = []
+    normals = []
+    sides = []
     for before, node, after in _corners_of(loop):
         arriving, leaving, turn = _corner(nodes, before, node, after)
         anchor, normal = _rounded_corner(nodes[node], arriving, leaving, turn)
         anchors.append(anchor)
         normals.append(normal)
-        near, far = stop_distances[node, after], stop_distances[after, node]
+        near = stop_distances[node, after]
+        far = stop_distances[after, node]
         length = float(np.linalg.norm(nodes[after] - nodes[node])) - near - far
         side = Side(
             nodes[node] + near * leaving, leaving, length, bool(not outside and rng.random() < 0.45)
@@ -314,7 +323,7 @@ def _make_lanes(
     lanes: list[Lane] = []
     for a, b in edges.tolist():
         for start, end in ((a, b), (b, a)):
-            direction = (nodes[end] - nodes[start]) / np.linalg.norm(nodes[end] - nodes[start])
+            direction = _unit(nodes[end] - nodes[start])
             offset = LANE_WIDTH_M / 2 * right_of(direction)
             first = nodes[start] + stop_distances[start, end] * direction + offset
             last = nodes[end] - stop_distances[end, start] * direction + offset
@@ -350,9 +359,10 @@ def _curve(before: Points, after: Points) -> Points:
     """Return the path of a turn from the end of one lane to the start of another: a cubic Bezier
     curve, close to an arc.
     """
-    first, last = before[-1], after[0]
-    leaving = (before[-1] - before[-2]) / np.linalg.norm(before[-1] - before[-2])
-    arriving = (after[1] - after[0]) / np.linalg.norm(after[1] - after[0])
+    first = before[-1]
+    last = after[0]
+    leaving = _unit(before[-1] - before[-2])
+    arriving = _unit(after[1] - after[0])
     reach = 0.38 * float(np.linalg.norm(last - first))
     control = np.stack([first, first + reach * leaving, last - reach * arriving, last])
     t = np.linspace(0, 1, max(8, int(reach / 0.38 / PATH_STEP_M) + 1))[:, None]

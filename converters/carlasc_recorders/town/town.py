@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from carlasc.core.arrays import FloatArray
-from carlasc.core.geometry import Transform, rotation_z, translation
+from carlasc.core.geometry import Transform
 from carlasc.core.tables import CARLA
 from carlasc_recorders.town import furniture
 from carlasc_recorders.town.furniture import (
@@ -49,9 +49,11 @@ GROUND, TERRAIN, WATER = (CARLA.id_of(name) for name in ("Ground", "Terrain", "W
 
 def pave_roads(plan: TownPlan, streets: Streets) -> None:
     """Add one level road surface below the whole town. The blocks lie on it."""
-    low, high = streets.nodes.min(axis=0) - 8, streets.nodes.max(axis=0) + 8
+    low = streets.nodes.min(axis=0) - 8
+    high = streets.nodes.max(axis=0) + 8
     tile = 12.0  # metres; with small triangles, rays are exact and the search tree is efficient
-    xs, ys = np.arange(low[0], high[0] + tile, tile), np.arange(low[1], high[1] + tile, tile)
+    xs = np.arange(low[0], high[0] + tile, tile)
+    ys = np.arange(low[1], high[1] + tile, tile)
     for x, following in pairwise(xs):
         plan.builder.ribbon(
             ROAD,
@@ -98,7 +100,8 @@ def _paint_line(
 
 def lay_sidewalk(plan: TownPlan, block: CityBlock) -> FloatArray:
     """Add the kerb and sidewalk around a block. Return the (K, 2) loop behind the sidewalk."""
-    kerb, inner = close_loop(block.outline.at(HALF_ROAD_M)), block.outline.at(INNER_M)
+    kerb = close_loop(block.outline.at(HALF_ROAD_M))
+    inner = block.outline.at(INNER_M)
     plan.builder.ribbon(SIDEWALK, at_height(kerb, -0.05), at_height(kerb, KERB_M))
     plan.builder.ribbon(SIDEWALK, at_height(kerb, KERB_M), at_height(close_loop(inner), KERB_M))
     return inner
@@ -112,13 +115,15 @@ def lay_ground(plan: TownPlan, loop: FloatArray, label: int) -> None:
         loop: (K, 2) boundary, metres.
         label: class id of the land.
     """
-    centre, rings = loop.mean(axis=0), 10
+    centre = loop.mean(axis=0)
+    rings = 10
     relief = 0.35 if label == TERRAIN else 0.0
     phase = plan.rng.uniform(0, 2 * np.pi, 4)
     previous = at_height(close_loop(loop), KERB_M)
     for ring in range(1, rings + 1):
         points = close_loop(centre + (loop - centre) * (1 - ring / rings))
-        x, y = points[:, 0] / 7.0, points[:, 1] / 9.0
+        x = points[:, 0] / 7.0
+        y = points[:, 1] / 9.0
         waves = np.sin(x + phase[0]) * np.sin(y + phase[1]) + 0.4 * np.sin(
             2.3 * x + phase[2]
         ) * np.sin(1.9 * y + phase[3])
@@ -152,7 +157,8 @@ def fill_block(plan: TownPlan, block: CityBlock, use: str) -> None:
 
 def _add_row_of_buildings(plan: TownPlan, side: Side, land: Land, downtown: bool) -> None:
     """Add buildings along a street: without gaps downtown, with front gardens elsewhere."""
-    rng, along = plan.rng, -6.0
+    rng = plan.rng
+    along = -6.0
     while along < side.length_m + 6:
         width = rng.uniform(*((12, 22) if downtown else (8, 13)))
         depth = rng.uniform(*((10, 15) if downtown else (8, 11)))
@@ -195,10 +201,8 @@ def _add_front_garden(
     drive = side.point(along + width + 1.8, INNER_M + bay + 3.2)
     if land.reserve(Rectangle(drive, (2.6, 5.6), side.yaw_rad), 0.2):
         plan.builder.boxes(GROUND, (*drive, KERB_M - 0.3), (2.8, 6.2, 0.33), side.yaw_rad)
-        pose = translation((*drive, KERB_M + 0.03)) @ rotation_z(
-            side.yaw_rad + np.pi / 2 * float(rng.choice([-1, 1]))
-        )
-        plan.parking.append(pose)
+        turn = np.pi / 2 * float(rng.choice([-1, 1]))
+        plan.park(drive, side.yaw_rad + turn, KERB_M + 0.03)
     for _ in range(2):
         position = side.point(
             along + rng.uniform(0, width),
@@ -211,10 +215,8 @@ def _add_front_garden(
 def _add_yard(plan: TownPlan, block: CityBlock, land: Land, attempts: int) -> None:
     """Add trees, fences, walls, bushes and trash behind the buildings where the land is free."""
     rng = plan.rng
-    span = np.ptp(land.boundary, axis=0)
-    low = land.boundary.min(axis=0)
     for _ in range(attempts):
-        position = low + rng.uniform(0, 1, 2) * span
+        position = land.draw(rng)
         number = rng.random()
         if number < 0.55:
             if land.reserve(Rectangle(position, (2.4, 2.4), 0.0), 0.5, 1.5):
@@ -241,7 +243,8 @@ def _add_park(plan: TownPlan, block: CityBlock, land: Land) -> None:
     """Add a lawn with a pond, benches, bins and many trees, a low wall along one street and a fence
     along another.
     """
-    rng, centre = plan.rng, land.boundary.mean(axis=0)
+    rng = plan.rng
+    centre = land.boundary.mean(axis=0)
     radius = rng.uniform(5, 8)
     land.occupied.append(Rectangle(centre, (2 * radius + 2, 2 * radius + 2), 0.0))
     angles = np.linspace(0, 2 * np.pi, 25)
@@ -265,9 +268,9 @@ def _add_park(plan: TownPlan, block: CityBlock, land: Land) -> None:
                 at,
                 side.yaw_rad,
             )
-    low, span = land.boundary.min(axis=0), np.ptp(land.boundary, axis=0)
     for _ in range(150):
-        position, number = low + rng.uniform(0, 1, 2) * span, rng.random()
+        position = land.draw(rng)
+        number = rng.random()
         size = 2.6 if number < 0.5 else 1.4
         if not land.reserve(Rectangle(position, (size, size), 0.0), 0.4, 0.8):
             continue
@@ -288,7 +291,8 @@ def _add_square(plan: TownPlan, block: CityBlock, land: Land) -> None:
     """Add a paved square: parking spaces, kiosks, planters, bollards along its edge, and one large
     building.
     """
-    rng, centre = plan.rng, land.boundary.mean(axis=0)
+    rng = plan.rng
+    centre = land.boundary.mean(axis=0)
     side = block.sides[rng.integers(len(block.sides))]
     footprint = Rectangle(centre + side.normal * 6, (rng.uniform(18, 26), 13.0), side.yaw_rad)
     if land.reserve(footprint, edge_m=3.0):
@@ -303,13 +307,11 @@ def _add_square(plan: TownPlan, block: CityBlock, land: Land) -> None:
             position = edge.point(at, offset + 6.5)
             if land.reserve(Rectangle(position, (2.2, 5.4), edge.yaw_rad), 0.2, 0.5):
                 turn = np.pi / 2 * float(rng.choice([-1, 1]))
-                pose = translation((*position, KERB_M)) @ rotation_z(edge.yaw_rad + turn)
-                plan.parking.append(pose)
+                plan.park(position, edge.yaw_rad + turn, KERB_M)
                 line = edge.point(at + 1.4, offset + 6.5)
                 plan.builder.level_rectangles(
                     ROAD_LINE, (*line, KERB_M + PAINT_M), (0.12, 4.8), edge.yaw_rad
                 )
-    low, span = land.boundary.min(axis=0), np.ptp(land.boundary, axis=0)
     makers: tuple[Callable[[], Mesh], ...] = (
         furniture.kiosk,
         lambda: furniture.planter(rng),
@@ -318,7 +320,7 @@ def _add_square(plan: TownPlan, block: CityBlock, land: Land) -> None:
         lambda: furniture.trash(rng),
     )
     for index in range(60):
-        position = low + rng.uniform(0, 1, 2) * span
+        position = land.draw(rng)
         if land.reserve(Rectangle(position, (3.2, 3.2), 0.0), 0.3, 1.0):
             plan.add(makers[index % len(makers)](), position, rng.uniform(0, 6))
 
@@ -363,7 +365,8 @@ OUTSKIRTS_M = 90.0  # width of the land around the town
 
 def fill_outskirts(plan: TownPlan, block: CityBlock) -> None:
     """Add the land around the town to its plan."""
-    rng, inner = plan.rng, lay_sidewalk(plan, block)
+    rng = plan.rng
+    inner = lay_sidewalk(plan, block)
     normals = block.outline.normal
     previous = at_height(close_loop(inner), KERB_M)
     for reach, rise in ((3.0, 0.0), (10.0, 0.3), (25.0, 1.0), (50.0, 2.0), (OUTSKIRTS_M, 3.0)):

@@ -82,18 +82,21 @@ class Traffic:
         self._limits = [_speed_limit(lane) for lane in streets.lanes]
         for vehicle in vehicles:
             self._extend_route(vehicle)
-        self._along = [np.array([vehicle.along_m for vehicle in vehicles])]
-        self._speed = [np.array([vehicle.speed_mps for vehicle in vehicles])]
+        self._states = [self._state()]
 
     def at(self, frame: int) -> tuple[FloatArray, FloatArray]:
         """Return the distance along its route, (V,) metres, and the speed, (V,) m/s, of every
         vehicle in a frame.
         """
-        while len(self._along) <= frame:
-            self._step(len(self._along))
-            self._along.append(np.array([vehicle.along_m for vehicle in self.vehicles]))
-            self._speed.append(np.array([vehicle.speed_mps for vehicle in self.vehicles]))
-        return self._along[frame], self._speed[frame]
+        while len(self._states) <= frame:
+            self._step(len(self._states))
+            self._states.append(self._state())
+        return self._states[frame]
+
+    def _state(self) -> tuple[FloatArray, FloatArray]:
+        rows = [(vehicle.along_m, vehicle.speed_mps) for vehicle in self.vehicles]
+        along, speed = np.array(rows).reshape(-1, 2).T
+        return along, speed
 
     def pose(self, index: int, along_m: float, wheelbase_m: float) -> Transform:
         """Return (4, 4) world_T_vehicle of a vehicle at a distance along its route.
@@ -103,13 +106,15 @@ class Traffic:
         vehicle = self.vehicles[index]
         front = self._point(vehicle, along_m + wheelbase_m / 2)
         rear = self._point(vehicle, along_m - wheelbase_m / 2)
-        middle, ahead = (front + rear) / 2, front - rear
+        middle = (front + rear) / 2
+        ahead = front - rear
         return translation((*middle, 0.0)) @ rotation_z(float(np.arctan2(ahead[1], ahead[0])))
 
     def _point(self, vehicle: Vehicle, along_m: float) -> FloatArray:
         leg = int(np.searchsorted(vehicle.starts, along_m, side="right")) - 1
         leg = min(max(leg, 0), len(vehicle.route) - 1)
-        lane, local = self.streets.lanes[vehicle.route[leg]], along_m - vehicle.starts[leg]
+        lane = self.streets.lanes[vehicle.route[leg]]
+        local = along_m - vehicle.starts[leg]
         if local < 0:  # before the first lane, the route is extended straight
             return lane.path[0] + local * (lane.path[1] - lane.path[0]) / np.linalg.norm(
                 lane.path[1] - lane.path[0]
@@ -174,7 +179,8 @@ class Traffic:
             )
             if index is None:
                 continue
-            vehicle, node = self.vehicles[index], self.streets.lanes[lane].end
+            vehicle = self.vehicles[index]
+            node = self.streets.lanes[lane].end
             if vehicle.granted > vehicle.leg:
                 continue  # already let in
             distance = vehicle.starts[vehicle.leg + 1] - vehicle.along_m - vehicle.length_m / 2
@@ -273,7 +279,8 @@ class Traffic:
         """
         vehicle = self.vehicles[index]
         leg = self._street_leg(vehicle)
-        nearest, speed = np.inf, 0.0
+        nearest = np.inf
+        speed = 0.0
         for ahead in range(leg, min(leg + 3, len(vehicle.route))):
             lane = vehicle.route[ahead]
             if self.streets.lanes[lane].turn:
@@ -288,7 +295,8 @@ class Traffic:
                     continue
                 gap = position - vehicle.along_m - (leader.length_m + vehicle.length_m) / 2
                 if gap < nearest:
-                    nearest, speed = gap, leader.speed_mps
+                    nearest = gap
+                    speed = leader.speed_mps
             if nearest < np.inf:
                 break
         return float(nearest), speed

@@ -16,6 +16,7 @@ from carlasc.core.scans import Scan
 from carlasc.core.tables import CARLA, CARLASC11
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.viewing import (
+    Look,
     Panel,
     Viewpoint,
     draw_panels,
@@ -43,7 +44,7 @@ views = pytest.mark.parametrize("view", ["perspective", "bev"])
 @pytest.mark.parametrize("spec", PUBLISHED, ids=str)
 def test_a_block_ahead_on_the_right_is_ahead_and_on_the_right(spec, view):
     grid = grid_with({(10, 5, -0.5): RED, (-10, -15, -0.5): BLUE}, spec)
-    picture = render_grid(grid, view=view, size=SIZE, legend=False, ego=False)
+    picture = render_grid(grid, look=Look(view=view, size=SIZE, legend=False, ego=False))
     red, blue = middle_of(red_pixels(picture)), middle_of(blue_pixels(picture))
     assert red[0] > SIZE[0] / 2 > blue[0]
     assert red[1] < blue[1]
@@ -56,10 +57,12 @@ def test_a_block_ahead_on_the_right_is_ahead_and_on_the_right(spec, view):
 @views
 def test_in_kittis_frame_left_is_left(view):
     grid = grid_with({(10, 5, -0.5): RED})  # y is left there
-    picture = render_grid(grid, view=view, size=SIZE, legend=False, ego=False, axes="right")
+    picture = render_grid(
+        grid, look=Look(view=view, size=SIZE, legend=False, ego=False, axes="right")
+    )
     column, _ = middle_of(red_pixels(picture))
     assert column < SIZE[0] / 2
-    mirrored = render_grid(grid, view=view, size=SIZE, legend=False, ego=False)[:, ::-1]
+    mirrored = render_grid(grid, look=Look(view=view, size=SIZE, legend=False, ego=False))[:, ::-1]
     differing = (np.abs(picture.astype(int) - mirrored) > 12).any(-1).mean()
     assert differing < 0.01  # the same picture in a mirror, sun included
 
@@ -70,7 +73,9 @@ def test_a_cylindrical_block_lies_at_its_azimuth():
     azimuth = np.deg2rad(120)
     column = int((azimuth - spec.lower[1]) / spec.voxel_size[1])
     labels[80:86, column - 1 : column + 2, 3:5] = RED
-    picture = render_grid(Grid(spec, labels), view="bev", size=(200, 200), legend=False, ego=False)
+    picture = render_grid(
+        Grid(spec, labels), look=Look(view="bev", size=(200, 200), legend=False, ego=False)
+    )
     x, y = middle_of(red_pixels(picture))
     assert np.arctan2(x - 100, 100 - y) == pytest.approx(azimuth, abs=0.05)
     assert np.hypot(x - 100, y - 100) == pytest.approx(83 / 128 * 100 * 0.98, abs=2)
@@ -78,16 +83,16 @@ def test_a_cylindrical_block_lies_at_its_azimuth():
 
 def test_up_is_up_and_near_voxels_hide_far_ones():
     tower = grid_with({(0, 0, 0.3): RED, (0, 0, -1.2): BLUE}, size_m=1.4)
-    picture = render_grid(tower, size=SIZE, legend=False, ego=False)
+    picture = render_grid(tower, look=Look(size=SIZE, legend=False, ego=False))
     assert middle_of(red_pixels(picture))[1] < middle_of(blue_pixels(picture))[1]
     wall = grid_with({(0, 0, -0.5): RED, (-3, 0, -0.5): BLUE}, size_m=2.4)
     level = Viewpoint(elevation_rad=0.0)
     assert not red_pixels(
-        render_grid(wall, viewpoint=level, size=SIZE, legend=False, ego=False)
+        render_grid(wall, look=Look(viewpoint=level, size=SIZE, legend=False, ego=False))
     ).any()
     behind = Viewpoint(azimuth_rad=np.pi, elevation_rad=0.0)
     assert not blue_pixels(
-        render_grid(wall, viewpoint=behind, size=SIZE, legend=False, ego=False)
+        render_grid(wall, look=Look(viewpoint=behind, size=SIZE, legend=False, ego=False))
     ).any()
 
 
@@ -95,7 +100,9 @@ def test_free_and_unknown_voxels_are_not_drawn():
     spec = PUBLISHED[0]
     nothing = Grid(spec, np.zeros(spec.size, np.uint8), np.zeros(spec.size, np.float32))
     free = Grid(spec, np.zeros(spec.size, np.uint8), np.ones(spec.size, np.float32))
-    np.testing.assert_array_equal(render_grid(nothing, size=SIZE), render_grid(free, size=SIZE))
+    np.testing.assert_array_equal(
+        render_grid(nothing, look=Look(size=SIZE)), render_grid(free, look=Look(size=SIZE))
+    )
 
 
 def test_the_picture_of_an_empty_grid_says_so():
@@ -103,7 +110,7 @@ def test_the_picture_of_an_empty_grid_says_so():
     empty = Grid(spec, np.zeros(spec.size, np.uint8))
     scene = grid_drawing(empty, ClassColors())
     assert scene.note == "no voxel is occupied"
-    picture = render_grid(empty, size=SIZE, ego=False)
+    picture = render_grid(empty, look=Look(size=SIZE, ego=False))
     silent = draw_panels(
         [Panel(type(scene)(scene.extent, grid_drawing(empty, ClassColors(), ego=False).mesh))],
         size=SIZE,
@@ -114,7 +121,7 @@ def test_the_picture_of_an_empty_grid_says_so():
 
 def test_a_sunlit_top_has_exactly_the_legends_colour():
     grid = grid_with({(0, 0, -0.5): BLUE}, size_m=4.0)
-    picture = render_grid(grid, view="bev", size=(400, 400), legend=False, ego=False)
+    picture = render_grid(grid, look=Look(view="bev", size=(400, 400), legend=False, ego=False))
     assert has_color(picture[150:250, 150:250], CARLA.colors[BLUE])
 
 
@@ -122,7 +129,8 @@ def test_a_sunlit_top_has_exactly_the_legends_colour():
 def test_the_legend_names_the_classes_present_and_no_other(view):
     grid = grid_with({(0, 0, -0.5): BLUE, (5, 5, -0.5): RED})
     with_legend, without = (
-        render_grid(grid, view=view, size=(640, 360), legend=shown) for shown in (True, False)
+        render_grid(grid, look=Look(view=view, size=(640, 360), legend=shown))
+        for shown in (True, False)
     )
     assert with_legend.shape == without.shape == (360, 640, 3)
     strip = with_legend[-40:] if view == "perspective" else with_legend[:, 400:]
@@ -134,7 +142,9 @@ def test_the_legend_names_the_classes_present_and_no_other(view):
 def test_palettes_change_the_colours_and_nothing_else():
     grid = grid_with({(0, 0, -0.5): BLUE}, size_m=4.0)
     pictures = {
-        name: render_grid(grid, view="bev", size=(600, 600), legend=False, ego=False, palette=name)
+        name: render_grid(
+            grid, look=Look(view="bev", size=(600, 600), legend=False, ego=False, palette=name)
+        )
         for name in ("class", "colorblind", "height")
     }
     assert has_color(pictures["colorblind"], palette.colorblind_palette(CARLA)[BLUE])
@@ -146,7 +156,7 @@ def test_palettes_change_the_colours_and_nothing_else():
 def test_labels_that_the_table_does_not_know_are_refused():
     grid = grid_with({(0, 0, -0.5): 17})
     with pytest.raises(FormatError, match="found 17"):
-        render_grid(grid, CARLASC11, size=SIZE)
+        render_grid(grid, CARLASC11, look=Look(size=SIZE))
 
 
 def scan_of(*clusters):
@@ -172,7 +182,9 @@ EXTENT = np.array([(x, y, z) for x in (-20.0, 20.0) for y in (-20.0, 20.0) for z
 @views
 def test_a_scans_points_lie_where_they_are(view):
     scan = scan_of(((10, 5, 0), RED, (0, 0, 0), 0), ((-10, -15, 0), BLUE, (0, 0, 0), 0))
-    picture = render_scan(scan, view=view, size=SIZE, legend=False, ego=False, extent=EXTENT)
+    picture = render_scan(
+        scan, look=Look(view=view, size=SIZE, legend=False, ego=False), extent=EXTENT
+    )
     red, blue = middle_of(red_pixels(picture)), middle_of(blue_pixels(picture))
     assert red[0] > SIZE[0] / 2 > blue[0]
     assert red[1] < blue[1]
@@ -184,9 +196,7 @@ def test_faces_hide_points_behind_them_and_not_those_in_front():
     behind, before = (
         render_scan(
             scan_of(((x, 0, -1.3), RED, (0, 0, 0), 0)),
-            viewpoint=level,
-            size=SIZE,
-            legend=False,
+            look=Look(viewpoint=level, size=SIZE, legend=False),
             extent=EXTENT,
         )
         for x in (6.0, -6.0)
@@ -197,7 +207,7 @@ def test_faces_hide_points_behind_them_and_not_those_in_front():
 def test_points_without_labels_are_drawn_by_height():
     scan = scan_of(((5, 0, -1.8), 0, (0, 0, 0), 0), ((-5, 0, 1.8), 0, (0, 0, 0), 0))
     picture = render_scan(
-        Scan(scan.points), view="bev", size=SIZE, legend=False, ego=False, extent=EXTENT
+        Scan(scan.points), look=Look(view="bev", size=SIZE, legend=False, ego=False), extent=EXTENT
     )
     rows, columns = np.nonzero((picture < 200).any(-1))
     ahead = picture[rows[rows < 90], columns[rows < 90]].mean(0)
@@ -208,7 +218,7 @@ def test_points_without_labels_are_drawn_by_height():
 def test_the_picture_of_a_scan_without_points_says_so():
     scan = Scan(np.empty((0, 3), np.float32), np.empty(0, np.uint8), np.empty((0, 3), np.float32))
     for flow in (False, True):
-        assert (render_scan(scan, size=SIZE, flow=flow, ego=False) < 200).any()
+        assert (render_scan(scan, look=Look(size=SIZE, ego=False), flow=flow) < 200).any()
 
 
 def test_points_that_are_not_finite_are_left_out():
@@ -216,7 +226,7 @@ def test_points_that_are_not_finite_are_left_out():
     broken = scan.points.copy()
     broken[:5] = np.nan
     picture = render_scan(
-        Scan(broken, scan.labels), view="bev", size=SIZE, legend=False, extent=EXTENT
+        Scan(broken, scan.labels), look=Look(view="bev", size=SIZE, legend=False), extent=EXTENT
     )
     assert red_pixels(picture).any()
 
@@ -240,7 +250,10 @@ def test_each_moving_actor_has_an_arrow_as_long_as_its_movement_in_one_second():
 def test_flow_points_the_right_way_in_the_picture():
     scan = scan_of(((0, 0, 0), BLUE, (8, 8, 0), 1), ((-10, -15, 0), RED, (0, 0, 0), 2))
     picture = render_scan(
-        scan, view="bev", size=(400, 400), legend=False, ego=False, flow=True, extent=EXTENT
+        scan,
+        look=Look(view="bev", size=(400, 400), legend=False, ego=False),
+        flow=True,
+        extent=EXTENT,
     )
     dark = (picture < 60).all(-1)
     rows, columns = np.nonzero(dark)
@@ -276,16 +289,20 @@ def test_a_comparison_is_drawn_side_by_side():
         grid_with({(0, 0, -0.5): RED}, size_m=5.0),
     )
     picture = render_comparison(
-        prediction, truth, size=(800, 300), errors=False, ego=False, legend=False
+        prediction, truth, look=Look(size=(800, 300), ego=False, legend=False), errors=False
     )
     assert middle_of(red_pixels(picture))[0] < 400 < middle_of(blue_pixels(picture))[0]
     with pytest.raises(ArgumentError, match="predicted grid"):
-        render_comparison(prediction, grid_with({(0, 0, -0.5): RED}, PUBLISHED[1]), size=SIZE)
+        render_comparison(
+            prediction, grid_with({(0, 0, -0.5): RED}, PUBLISHED[1]), look=Look(size=SIZE)
+        )
 
 
 def test_a_picture_is_the_same_every_time():
     grid = grid_with({(10, 5, -0.5): RED})
-    np.testing.assert_array_equal(render_grid(grid, size=SIZE), render_grid(grid, size=SIZE))
+    np.testing.assert_array_equal(
+        render_grid(grid, look=Look(size=SIZE)), render_grid(grid, look=Look(size=SIZE))
+    )
 
 
 def test_edges_of_voxels_are_drawn_only_if_the_voxels_are_large():
@@ -296,7 +313,7 @@ def test_edges_of_voxels_are_drawn_only_if_the_voxels_are_large():
 
     def shades(size):
         picture = render_grid(
-            Grid(spec, labels), view="bev", size=size, legend=False, ego=False
+            Grid(spec, labels), look=Look(view="bev", size=size, legend=False, ego=False)
         ).astype(int)
         middle = picture[
             int(size[1] * 0.35) : int(size[1] * 0.65), int(size[0] * 0.35) : int(size[0] * 0.65)
@@ -306,21 +323,23 @@ def test_edges_of_voxels_are_drawn_only_if_the_voxels_are_large():
     assert shades((400, 400)) > 20
     tiny = grid_with({}, GridSpec.published("fine"))
     tiny.labels[:, :, 0] = CARLA.id_of("Terrain")
-    picture = render_grid(tiny, view="bev", size=(200, 200), legend=False, ego=False).astype(int)
+    picture = render_grid(
+        tiny, look=Look(view="bev", size=(200, 200), legend=False, ego=False)
+    ).astype(int)
     assert np.abs(picture[80:120, 80:120] - light).max() < 12
 
 
 @pytest.mark.parametrize("view", ["front", ""])
 def test_an_unknown_view_is_refused(view):
     with pytest.raises(ArgumentError, match="view"):
-        render_grid(grid_with({}), view=view, size=SIZE)
+        render_grid(grid_with({}), look=Look(view=view, size=SIZE))
     with pytest.raises(ArgumentError, match="panels"):
         draw_panels([])
 
 
 def test_unknown_axes_are_refused():
     with raises(ArgumentError, where="axes", expected="left, right", found="up"):
-        render_grid(grid_with({}), axes="up", size=SIZE)
+        render_grid(grid_with({}), look=Look(axes="up", size=SIZE))
 
 
 def test_points_have_the_colours_of_their_classes_and_a_legend():
@@ -402,7 +421,9 @@ def test_the_legend_names_the_classes_of_all_panels():
 @pytest.mark.parametrize("axes", ["left", "right"])
 def test_shadows_fall_ahead_to_the_right(axes):
     tower = grid_with({(0, 0, z): BLUE for z in (-1.5, -0.5, 0.5)})
-    picture = render_grid(tower, view="bev", size=(400, 400), legend=False, ego=False, axes=axes)
+    picture = render_grid(
+        tower, look=Look(view="bev", size=(400, 400), legend=False, ego=False, axes=axes)
+    )
     right, ahead = (int(400 * 0.98 / 51.2 * metres) for metres in (1.3, 1.0))
     assert picture[200 - ahead, 200 + right].max() < 200  # in the shadow
     for row, column in (
@@ -419,7 +440,8 @@ def test_walls_hide_a_part_of_the_sky():
     wall = {(2.4, y, z): BLUE for y in (-2, -1, 0, 1, 2) for z in (-1.5, -0.5, 0.5)}
     lone, beside = (
         render_grid(
-            grid_with(blocks, size_m=1.6), view="bev", size=(400, 400), legend=False, ego=False
+            grid_with(blocks, size_m=1.6),
+            look=Look(view="bev", size=(400, 400), legend=False, ego=False),
         )
         for blocks in (ground, ground | wall)
     )
@@ -436,7 +458,7 @@ def test_points_behind_others_are_darker():
         np.full(x.size, RED, np.uint8),
     )
     picture = render_scan(
-        scan, view="bev", size=(400, 400), legend=False, ego=False, extent=EXTENT
+        scan, look=Look(view="bev", size=(400, 400), legend=False, ego=False), extent=EXTENT
     ).astype(float)
     below = picture[150:250, 150:200].mean((0, 2))  # columns from the left towards the edge
     assert below[-2] < 0.9 * below[:40].mean()
