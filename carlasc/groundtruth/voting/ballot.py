@@ -332,7 +332,7 @@ class Ballot:
             self._tally = self._tally._replace(candidates=grown)
 
 
-_KEPT = threading.local()  # arrays by length and type
+_KEPT = threading.local()  # one array of each type
 
 
 def _take(count: int, dtype: np.dtype[Any], value: int) -> AnyArray:
@@ -341,16 +341,13 @@ def _take(count: int, dtype: np.dtype[Any], value: int) -> AnyArray:
     When a new array is written first, the system clears each of its pages, which takes longer than
     the votes in a fine grid.
     """
-    kept = vars(_KEPT).pop(f"{count} {dtype}", None)
-    return np.full(count, value, dtype) if kept is None else kept
+    kept = vars(_KEPT).pop(dtype.str, ())
+    return kept if len(kept) == count else np.full(count, value, dtype)
 
 
 def _keep(array: AnyArray) -> None:
     """Keep an array, whose elements have their first value again, for a later ballot."""
-    others = [name for name, other in vars(_KEPT).items() if abs(len(other) - len(array)) > 1]
-    for name in others:  # of another grid
-        delattr(_KEPT, name)
-    setattr(_KEPT, f"{len(array)} {array.dtype}", array)
+    setattr(_KEPT, array.dtype.str, array)
 
 
 def _ready(values: AnyArray, dtype: type[np.generic]) -> AnyArray:
