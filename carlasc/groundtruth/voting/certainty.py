@@ -297,7 +297,7 @@ def agree(votes: AnyArray, spec: GridSpec, classes: ClassTable) -> ClassConsensu
     counted = np.bincount(votes["label"]) > 0
     present = np.flatnonzero(counted)
     numbers = np.cumsum(counted) - 1
-    cast = _Cast(*_split_votes(votes, numbers, spec.num_voxels), spec.size)
+    cast = _Cast._make((*_split_votes(votes, numbers, spec.num_voxels), spec.size))
 
     # The majority in voxels with many scans stands for the truth there, instead of the iterations
     # of Dawid and Skene. Classes without such voxels get the usual share of errors, spread evenly
