@@ -304,13 +304,11 @@ def _count(points: AnyFloatArray, poses: FloatArray, cells: Cells, counts: Int32
             xs, ys, zs = points[0, begin:end], points[1, begin:end], points[2, begin:end]
             if cells.cylindrical:
                 for i in range(len(xs)):
-                    point = np.float64(xs[i]), np.float64(ys[i]), np.float64(zs[i])
-                    x, y, z = transform(pose, point[0], point[1], point[2])
+                    x, y, z = transform(pose, xs[i], ys[i], zs[i])
                     voxels[i] = find_voxel(x, y, z, cells)
             else:
                 for i in range(len(xs)):
-                    point = np.float64(xs[i]), np.float64(ys[i]), np.float64(zs[i])
-                    x, y, z = transform(pose, point[0], point[1], point[2])
+                    x, y, z = transform(pose, xs[i], ys[i], zs[i])
                     voxels[i] = find_in_box(x, y, z, cells)
             for voxel in voxels[: len(xs)]:
                 if voxel < len(counts):

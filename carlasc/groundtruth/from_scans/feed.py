@@ -58,15 +58,9 @@ _SAMPLES = 5  # number of scans that decide whether labels name the ground
 # greatest share of ground points with other classes: walls and kerbs give 2 to 4%, labels that are
 # often wrong 15%
 _OTHERWISE = 0.1
-# fields of a scan that are read for merging
-_USED = (
-    "labels",
-    "flow",
-    "instances",
-    "origins",
-    "probabilities",
-    "seconds",
-)
+# fields of a scan that are read for its votes, and to find motion
+_VOTING = "labels", "origins", "probabilities", "seconds"
+_USED = *_VOTING, "flow", "instances"
 _STEP_S = 0.005  # points of a scan within this time are seen at one instant: 7 cm at 15 m/s
 _LATE_S = 3.0  # no point is farther in time from its frame: see `check_scan`
 _PARTS = 30  # with `window_m`, scans are at least this part of it apart
@@ -395,9 +389,10 @@ class ScanFeed:
         """Read a scan for merging; the most recent ones are cached."""
         with self._lock:
             if frame not in self._scans:
-                scan = self._voting_points(frame)
+                shows_motion = "flow" in self.motion
+                scan = self._voting_points(frame, _USED if shows_motion else _VOTING)
                 moving = self.classes.have_role(_labels(scan), "moving")
-                if "flow" in self.motion and scan.flow is not None:
+                if shows_motion and scan.flow is not None:
                     moving |= is_fast(scan.flow, self.options.motion.min_speed_m_s)
                 self._scans[frame] = PreparedScan.of(
                     frame,
@@ -496,12 +491,12 @@ class ScanFeed:
             return segment_by_instances(frame, scan, pose, ground=ground)
         return segment_by_boxes(frame, scan, pose, boxes, ground=ground) if by == "boxes" else []
 
-    def _voting_points(self, frame: int) -> Scan:
+    def _voting_points(self, frame: int, fields: Sequence_[str] = _USED) -> Scan:
         """Read the voting points of a scan: without unlabelled, too near and too far ones.
 
         Points with one origin follow each other.
         """
-        scan = self.sequence.scan(frame, _USED)
+        scan = self.sequence.scan(frame, fields)
         check_finite(scan.points, f"{self.sequence.location}: points of frame {frame}")
         if scan.labels is None:
             scan = replace(scan, labels=np.full(len(scan), self.classes.geometry_id, np.uint32))

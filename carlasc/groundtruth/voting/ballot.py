@@ -12,7 +12,7 @@ import math
 import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from carlasc.core.arrays import (
     AnyArray,
     BoolArray,
     Float32Array,
+    Int32Array,
     IntArray,
     LabelArray,
     Uint8Array,
@@ -226,7 +227,7 @@ class Ballot:
             once,
             free=np.zeros(spec.num_voxels + 1, np.uint32),
             passed=np.zeros(spec.num_voxels + 1 if once else 0, np.uint8),
-            heads=_take(spec.num_voxels, np.dtype(np.int32), kernel.NONE),
+            heads=_no_heads(spec.num_voxels),
             candidates=np.empty(0, kernel.CANDIDATE_DTYPE),
             used=np.zeros(1, np.int64),
         )
@@ -261,7 +262,7 @@ class Ballot:
 
     def add_points(self, seen: Iterable[SeenClass]) -> None:
         """Add the votes of points without rays, one class after the other."""
-        counted = _take(self.spec.num_voxels + 1, kernel.HIT_DTYPE, 0)
+        counted = np.zeros(self.spec.num_voxels + 1, kernel.HIT_DTYPE)
         for label, voters, regions, region in seen:
             points, number = sum(one.points.shape[1] for one in voters), 0
             hit = np.empty(min(points, len(counted)), np.int32)
@@ -276,7 +277,6 @@ class Ballot:
                     self._widen(place, pose, regions, region)
             self._make_room(number)
             kernel.add_hits(label, counted, doubt, hit[:number], regions, region, self._tally)
-        _keep(counted)
 
     def _widen(
         self, points: Float32Array, pose: Pose, regions: Uint16Array = _EVERYWHERE, region: int = 0
@@ -312,10 +312,9 @@ class Ballot:
         occupied = np.empty(len(candidates), OCCUPIED_DTYPE)
         kernel.collect(self._tally.heads, candidates, occupied)
         if not copy:
-            heads, none = self._tally.heads, np.empty(0, np.int32)
-            heads[candidates["voxel"]] = kernel.NONE
-            _keep(heads)
-            self._tally = self._tally._replace(heads=none)
+            _KEPT.heads = self._tally.heads
+            _KEPT.heads[candidates["voxel"]] = kernel.NONE
+            self._tally = self._tally._replace(heads=_Kept.heads)
         free = self.free.reshape(self.spec.size)
         boxes = self._boxes.copy() if copy and self._boxes is not None else self._boxes
         return Votes(self.spec, self.classes, free.copy() if copy else free, occupied, boxes)
@@ -332,25 +331,20 @@ class Ballot:
             self._tally = self._tally._replace(candidates=grown)
 
 
-_KEPT = threading.local()  # arrays by length and type
-
-
-def _take(count: int, dtype: np.dtype[Any], value: int) -> AnyArray:
-    """Return an array of a value: one that an earlier ballot of this thread kept, if there is one.
-
-    When a new array is written first, the system clears each of its pages, which takes longer than
-    the votes in a fine grid.
+class _Kept(threading.local):
+    """The heads of a ballot of this thread that is complete, for the next one: when a new array is
+    first written, the system clears each of its pages.
     """
-    kept = vars(_KEPT).pop(f"{count} {dtype}", None)
-    return np.full(count, value, dtype) if kept is None else kept
+
+    heads = np.empty(0, np.int32)
 
 
-def _keep(array: AnyArray) -> None:
-    """Keep an array, whose elements have their first value again, for a later ballot."""
-    others = [name for name, other in vars(_KEPT).items() if abs(len(other) - len(array)) > 1]
-    for name in others:  # of another grid
-        delattr(_KEPT, name)
-    setattr(_KEPT, f"{len(array)} {array.dtype}", array)
+_KEPT = _Kept()
+
+
+def _no_heads(count: int) -> Int32Array:
+    heads, _KEPT.heads = _KEPT.heads, _Kept.heads
+    return heads if len(heads) == count else np.full(count, kernel.NONE, np.int32)
 
 
 def _ready(values: AnyArray, dtype: type[np.generic]) -> AnyArray:

@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -296,20 +296,8 @@ def agree(votes: AnyArray, spec: GridSpec, classes: ClassTable) -> ClassConsensu
         return ClassConsensus(labels, np.empty(0, dtype), 0.0)
     counted = np.bincount(votes["label"]) > 0
     present = np.flatnonzero(counted)
-    count = len(votes)
-    cast = _Cast(
-        np.empty(count, np.int32),
-        np.zeros(count + 1, np.int64),
-        np.empty(count, np.int64),
-        np.empty(count),
-        np.empty(count),
-        np.full(spec.num_voxels, -1, np.int32),
-        spec.size,
-    )
-    count = _split_votes(votes, np.cumsum(counted) - 1, cast)
-    cast = cast._replace(
-        voxels=cast.voxels[:count], begins=cast.begins[: count + 1], total=cast.total[:count]
-    )
+    numbers = np.cumsum(counted) - 1
+    cast = _Cast._make((*_split_votes(votes, numbers, spec.num_voxels), spec.size))
 
     # The majority in voxels with many scans stands for the truth there, instead of the iterations
     # of Dawid and Skene. Classes without such voxels get the usual share of errors, spread evenly
@@ -357,32 +345,27 @@ def _needed(confusion: FloatArray, frequency: FloatArray) -> FloatArray:
 
 
 @cached
-def _split_votes(votes: AnyArray, numbers: IntArray, cast: _Cast) -> int:
-    """Write the votes by voxel, and return the number of voxels.
-
-    Args:
-        votes: (M,) as in `agree`.
-        numbers: index of each class.
-        cast: output; all `begins` are 0, and all `rows` -1.
-    """
-    voxels, begins, own, weight, total, rows, _ = cast
+def _split_votes(votes: AnyArray, numbers: IntArray, num_voxels: int) -> Any:
+    """Return the arrays of `_Cast` for (M,) votes, as in `agree`, with an index for each class."""
+    voxels, begins = np.empty(len(votes), np.int32), np.zeros(len(votes) + 1, np.int64)
+    own, weight, total = np.empty(len(votes), np.int64), np.empty(len(votes)), np.zeros(len(votes))
+    rows = np.full(num_voxels, -1, np.int32)  # dense: neighbours are found without a search
     row, count = 0, 0
     while row < len(votes):
-        begin, voxel, voters, points = row, votes[row].voxel, 0, 0
+        voxel, voters, points = votes[row].voxel, 0, 0
+        voxels[count], rows[voxel] = voxel, count
         while row < len(votes) and votes[row].voxel == voxel:
             voters, points = max(voters, votes[row].voters), points + votes[row].votes
             row += 1
         # Errors of the points of one scan are correlated, so each scan has one vote, which is split
         # among its classes.
-        whole = 0.0
-        for k in range(begin, row):
+        for k in range(begins[count], row):
             own[k] = numbers[votes[k].label]
             weight[k] = votes[k].sure * (voters / points)
-            whole += weight[k]
-        voxels[count], total[count], rows[voxel] = voxel, whole, count
+            total[count] += weight[k]
         count += 1
         begins[count] = row
-    return count
+    return voxels[:count], begins[: count + 1], own, weight, total[:count], rows
 
 
 @cached
