@@ -224,8 +224,9 @@ class ActorFollower:
         """Forget observations before a frame, but not those of how the last scans move."""
         self.moved = {scan: moved for scan, moved in self.moved.items() if scan >= frame}
         self._close = [close for close in self._close if close[0] >= frame]
-        del self._beside[:-_BESIDE]
-        self._cells = {n: cells for n, cells in self._cells.items() if n >= self._number - _BESIDE}
+        oldest = self._number - _BESIDE
+        self._cells = {n: cells for n, cells in self._cells.items() if n >= oldest}
+        self._beside = [number for number in self._beside if number >= oldest]
         for one in self._alive:
             one.links = [
                 *(link for link in one.links[:-_HISTORY] if link.segment.frame >= frame),
