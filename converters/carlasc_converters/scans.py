@@ -148,9 +148,9 @@ class Scans(Converter):
             )
         folders = sorted(entry.path for entry in os.scandir(self.source) if entry.is_dir())
         inner = [path for path in map(Path, folders) if self._scans_in(path)]
-        own = {path.suffix.lower() for path in self._scans_in(self.source)}
+        own = {path.suffix.lower() for path in self._scans_in(self.source)} if inner else set()
         # tables beside folders of scans are their poses and times
-        if own - set(_TABLES) or (own and not inner):
+        if not inner or own - set(_TABLES):
             return self.source
         if len(inner) > 1:
             raise MissingDataError(
@@ -159,7 +159,7 @@ class Scans(Converter):
                 found=f"the folders {', '.join(path.name for path in inner)}",
                 advice="give one of them, or the poses of several LiDARs with `calibration`",
             )
-        return inner[0] if inner else self.source
+        return inner[0]
 
     def _scans_in(self, folder: Path) -> list[Path]:
         """Return the files of a folder that may be scans, without those of poses and times."""
