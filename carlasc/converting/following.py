@@ -380,11 +380,10 @@ class _Drive:
         behind_s = now - self.arrived[self._written - 1]
         grids_s = now - self.arrived[last]
         every = (made[-1] - made[0]) / max(len(made) - 1, 1)
-        rate = f", of every {every:.0f}th scan" if every else ""
         self.folder.say(
             f"{count(self._written, 'scan')}, {behind_s:.1f} s behind the sensor; "
             f"{count(len(made), 'provisional grid')}, the last {grids_s:.1f} s after its window "
-            f"was complete{rate}"
+            f"was complete, of every {max(every, 1):.0f}th scan"
         )
 
     def finish(self) -> None:

@@ -116,7 +116,6 @@ class _GrowingDrive:
         self._judged = [one for one in [*self._judged, frame] if one >= oldest]
         self.feed.use(self.feed.sequence, self._judged)
         self._follower.forget_before(oldest)
-        self._tracks = {n: one for n, one in self._tracks.items() if max(one.members) >= oldest}
 
     def make_grid(self) -> list[int]:
         """Make and write the grid of the newest frame whose window is complete, unless it is
@@ -167,7 +166,11 @@ class _GrowingDrive:
         times, deformable = self.feed.times, self.feed.classes.deformable
         tracks = [track_of(actor, times, deformable) for actor in actors]
         gone = self._follower.replaced | self._follower.riders
-        self._tracks = {n: track for n, track in self._tracks.items() if n not in gone}
+        self._tracks = {
+            number: track
+            for number, track in self._tracks.items()
+            if number not in gone and max(track.members) >= self._judged[0]
+        }
         self._follower.replaced.clear()
         whole = complete_bodies(tracks, self._tracks.values())
         self._tracks |= {track.instance: track for track in whole if track.moves}

@@ -196,9 +196,9 @@ class ActorFollower:
 
     def again(self, before_s: float, most: int) -> list[FoundActor]:
         """Return some of the actors that have not ended, under new numbers: at most `most` of those
-        that began, or were estimated, before a time, and were seen since.
+        that began, or were estimated, before a time.
         """
-        due = [one for one in self._alive if one.estimated_s < min(before_s, one.last.seconds)]
+        due = [one for one in self._alive if one.estimated_s < before_s]
         return self._actors(sorted(due, key=lambda one: one.estimated_s)[:most])
 
     def find_own(self) -> None:
@@ -256,8 +256,6 @@ class ActorFollower:
     def _actors(self, chains: list[_ActorChain]) -> list[FoundActor]:
         actors, ground_m = [], float(np.median(self._grounds or [np.nan]))
         for one in chains:
-            if one.estimated_s == one.last.seconds:  # nothing was seen of it since
-                continue
             self.replaced.add(one.number)
             one.number, one.estimated_s = 0, one.last.seconds
             if actor := one.actor(self._deformable, self._number, self._label):
