@@ -66,7 +66,7 @@ from carlasc.storage.opening import as_sink
 from carlasc.storage.protocol import Sink, Source
 
 _LOOK_S = 0.5  # between two looks at the folder
-_BATCH = 10  # scans that are written together, at most
+_BATCH = 5  # scans that are written together, at most
 _PAUSE_S = 3.0  # a pause of the sensor that is noted
 _SAID_S = 10.0  # between two lines on the progress
 _CALLS = 2  # of a maker that wait for its result
@@ -217,6 +217,7 @@ class _Drive:
     lines: list[Transform] = field(default_factory=list)
     _waiting: dict[int, tuple[FrameHandle, Assembled]] = field(default_factory=dict)
     _written: int = 0
+    _poses: bytes = b""
     _grid: GridPlan | None = None
     _making: list[Future[tuple[list[int], list[str]]]] = field(default_factory=list)
     _made: list[int] = field(default_factory=list)
@@ -296,13 +297,15 @@ class _Drive:
         if (known := len(self.lines)) > self._written:
             plan, times = self.plan, self.plan.times[:known]
             poses = np.stack(self.lines)
+            fresh = poses[self._written :]
+            stored = mirror_poses(fresh) if self.target.mirrored else fresh
+            self._poses += files.encode_poses(stored)
             new = slice(max(self._written - 1, 0), known)
             if jump := describe_jumps(np.arange(known)[new], poses[new], times[new]):
                 self.folder.say(f"the sensor jumped: {jump}")
-            stored = mirror_poses(poses) if self.target.mirrored else poses
             earlier = MadeFrom.read(plan.writer, CONVERSION).frames
             self._mark(earlier | dict.fromkeys(map(str, range(self._written, known)), "done"))
-            plan.writer.write_document(files.POSES, files.encode_poses(stored))
+            plan.writer.write_document(files.POSES, self._poses)
             plan.writer.write_document(files.TIMES, files.encode_times(times - times[0]))
             for number in sorted(n for n in self._waiting if n < known):
                 handle, scan = self._waiting.pop(number)
@@ -377,11 +380,10 @@ class _Drive:
         behind_s = now - self.arrived[self._written - 1]
         grids_s = now - self.arrived[last]
         every = (made[-1] - made[0]) / max(len(made) - 1, 1)
-        rate = f", of every {every:.0f}th scan" if every else ""
         self.folder.say(
             f"{count(self._written, 'scan')}, {behind_s:.1f} s behind the sensor; "
             f"{count(len(made), 'provisional grid')}, the last {grids_s:.1f} s after its window "
-            f"was complete{rate}"
+            f"was complete, of every {max(every, 1):.0f}th scan"
         )
 
     def finish(self) -> None:

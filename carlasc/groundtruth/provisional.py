@@ -10,8 +10,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import cast
 
-import numpy as np
-
 from carlasc.errors import CarlascError
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.motion_pass import follower_of, track_of
@@ -34,7 +32,7 @@ _AFTER_S = 0.8  # scans up to so much later show what moves in a scan
 # A track is estimated again after so much of the drive: of so many actors with each scan, at most.
 _AGAIN_S, _TOGETHER = 2.0, 2
 _KEPT = 80  # frames whose observations of actors are kept, at least
-_MOST, _EACH = 120, 4  # scans that may wait; N grows by one with so many of them
+_MOST, _EACH = 120, 6  # scans that may wait; N grows by one with so many of them
 
 
 def make_provisional(
@@ -86,11 +84,12 @@ class _GrowingDrive:
         movable = feed.classes.movable if feed.trusts_ground_labels else ()
         self._evidence = EvidenceWindow(movable, after_s=_AFTER_S)
         self._follower = follower_of(feed)
-        self._tracks, self._searched_s = dict[int, Track](), -np.inf
+        self._tracks = dict[int, Track]()
 
     def choose(self, sequence: Sequence) -> list[int]:
         """Return the scans to take: every N-th one."""
         self.feed.use(sequence, self._judged)
+        self._follower.find_own()
         frames, known = sequence.frames("points").tolist(), len(sequence.poses)
         new = [frame for frame in frames if self._next <= frame < known][-_MOST:]
         self._every = 1 + len(new) // _EACH
@@ -108,12 +107,8 @@ class _GrowingDrive:
             return
         for found in self._evidence.add(self.feed.evidence_scan(frame, ())):
             self._judge(found.frame)
-            follower, before_s = self._follower, found.seconds - _AGAIN_S
-            actors = follower.add(found.thinned())
-            self._track([*actors, *follower.again(before_s, _TOGETHER)])
-            if self._searched_s <= before_s:
-                self._searched_s = found.seconds
-                follower.find_own()
+            self._track(self._follower.add(found.thinned()))
+            self._track(self._follower.again(found.seconds - _AGAIN_S, _TOGETHER))
 
     def _judge(self, frame: int) -> None:
         """Merge a frame from now on, and forget old ones."""
@@ -121,7 +116,6 @@ class _GrowingDrive:
         self._judged = [one for one in [*self._judged, frame] if one >= oldest]
         self.feed.use(self.feed.sequence, self._judged)
         self._follower.forget_before(oldest)
-        self._tracks = {n: one for n, one in self._tracks.items() if max(one.members) >= oldest}
 
     def make_grid(self) -> list[int]:
         """Make and write the grid of the newest frame whose window is complete, unless it is
@@ -137,11 +131,13 @@ class _GrowingDrive:
         if not self._unmade:
             self._begin_grid(number)
         self._unmade = number + 1
-        near = self._actors_now().between(number + self.first, number + self.last)
-        frame = ScanFrame(ScanWindow(self.feed, near), number, number)
+        follower, numbers = self._follower, {n: n - FIRST_FOUND + 1 for n in self._tracks}
+        actors = MovingActors(
+            self._tracks, follower.moved, own=tuple(follower.own), numbers=numbers
+        )
+        frame = ScanFrame(ScanWindow(self.feed, actors), number, number)
         task = FrameTask(number, frame, self.plan, self.feed.classes, False)
-        made, _ = task.outputs_of(frame.make(self.plan), frame)
-        fields = {n: data for n, data in made.items() if n.startswith(f"{self.plan.grid}/")}
+        fields, _ = task.outputs_of(replace(frame.make(self.plan), fields={}), frame)
         self.writer.write_frames({number: fields})
         return [number]
 
@@ -167,19 +163,17 @@ class _GrowingDrive:
         """Estimate the tracks of actors, instead of earlier ones of the same actors. The others
         stay, with what is kept of them.
         """
-        follower, classes = self._follower, self.feed.classes
-        tracks = [track_of(actor, self.feed.times, classes.deformable) for actor in actors]
-        gone, follower.replaced = follower.replaced, set()
-        stay = {n: track for n, track in self._tracks.items() if n not in gone}
-        whole = complete_bodies(tracks, stay.values())
-        self._tracks = stay | {track.instance: track for track in whole if track.moves}
-
-    def _actors_now(self) -> MovingActors:
-        """Return the moving actors."""
-        follower = self._follower
-        tracks = {n: one for n, one in self._tracks.items() if n not in follower.riders}
-        numbers = {number: number - FIRST_FOUND + 1 for number in tracks}
-        return MovingActors(tracks, follower.moved, own=tuple(follower.own), numbers=numbers)
+        times, deformable = self.feed.times, self.feed.classes.deformable
+        tracks = [track_of(actor, times, deformable) for actor in actors]
+        gone = self._follower.replaced | self._follower.riders
+        self._tracks = {
+            number: track
+            for number, track in self._tracks.items()
+            if number not in gone and max(track.members) >= self._judged[0]
+        }
+        self._follower.replaced.clear()
+        whole = complete_bodies(tracks, self._tracks.values())
+        self._tracks |= {track.instance: track for track in whole if track.moves}
 
 
 _DRIVES: dict[str, _GrowingDrive] = {}  # the drive of this process, by its key

@@ -66,7 +66,7 @@ _LINE_SLOPE = 0.004  # a quarter of a degree: the points of one scan line differ
 # Parts of the recording vehicle: cells around the sensor in which nearly all scans have points,
 # often at places that were free at other times; and cells beside them with such points.
 _ALWAYS, _FREED, _OFTEN = 0.95, 0.3, 0.3
-_BESIDE = 500  # actors that are remembered, while scans come
+_BESIDE = 500  # actors, and heights of the ground, that are remembered while scans come
 _BESIDE_M = 1.8  # farther beside the way of the sensor, another vehicle may drive along
 # What stands on the ground beside the sensor is a rider or a person, who keeps its pace: so near
 # above the ground, and so high and not longer. So is what is so high and shifts by so much beside
@@ -196,9 +196,9 @@ class ActorFollower:
 
     def again(self, before_s: float, most: int) -> list[FoundActor]:
         """Return some of the actors that have not ended, under new numbers: at most `most` of those
-        that began, or were estimated, before a time, and were seen since.
+        that began, or were estimated, before a time.
         """
-        due = [one for one in self._alive if one.estimated_s < min(before_s, one.last.seconds)]
+        due = [one for one in self._alive if one.estimated_s < before_s]
         return self._actors(sorted(due, key=lambda one: one.estimated_s)[:most])
 
     def find_own(self) -> None:
@@ -224,8 +224,10 @@ class ActorFollower:
         """Forget observations before a frame, but not those of how the last scans move."""
         self.moved = {scan: moved for scan, moved in self.moved.items() if scan >= frame}
         self._close = [close for close in self._close if close[0] >= frame]
-        del self._beside[:-_BESIDE]
-        self._cells = {n: cells for n, cells in self._cells.items() if n >= self._number - _BESIDE}
+        del self._grounds[:-_BESIDE]
+        oldest = self._number - _BESIDE
+        self._cells = {n: cells for n, cells in self._cells.items() if n >= oldest}
+        self._beside = [number for number in self._beside if number >= oldest]
         for one in self._alive:
             one.links = [
                 *(link for link in one.links[:-_HISTORY] if link.segment.frame >= frame),
@@ -254,8 +256,6 @@ class ActorFollower:
     def _actors(self, chains: list[_ActorChain]) -> list[FoundActor]:
         actors, ground_m = [], float(np.median(self._grounds or [np.nan]))
         for one in chains:
-            if one.estimated_s == one.last.seconds:  # nothing was seen of it since
-                continue
             self.replaced.add(one.number)
             one.number, one.estimated_s = 0, one.last.seconds
             if actor := one.actor(self._deformable, self._number, self._label):

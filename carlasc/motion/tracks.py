@@ -435,16 +435,14 @@ class MovingActors:
         """Return the part for the frames from `first` to `last`, which is small enough to send to a
         worker with each frame.
         """
-        near = {number: track.between(first, last) for number, track in self.tracks.items()}
         # A track may reach the frames by extrapolation only, with poses and without members.
         tracks = {
-            number: track
-            for number, track in near.items()
-            if track.members or len(track.world_T_actor)
+            number: track.between(first, last)
+            for number, track in self.tracks.items()
+            if track.first <= last and track.first + len(track.world_T_actor) > first
         }
-        moving = {
-            frame: members for frame, members in self.moving.items() if first <= frame <= last
-        }
+        frames = range(first, last + 1)
+        moving = {frame: self.moving[frame] for frame in frames if frame in self.moving}
         numbers = {number: self.numbers[number] for number in tracks} if self.numbers else {}
         return MovingActors(tracks, moving, own=self.own, numbers=numbers)
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -147,12 +148,11 @@ class Scans(Converter):
                 found="a file" if self.source.exists() else "no such folder",
                 advice=raw_advice([self.source.name]),
             )
-        inner = [
-            path for path in sorted(self.source.iterdir()) if path.is_dir() and self._scans_in(path)
-        ]
-        own = {path.suffix.lower() for path in self._scans_in(self.source)}
+        folders = sorted(entry.path for entry in os.scandir(self.source) if entry.is_dir())
+        inner = [path for path in map(Path, folders) if self._scans_in(path)]
+        own = {path.suffix.lower() for path in self._scans_in(self.source)} if inner else set()
         # tables beside folders of scans are their poses and times
-        if own - set(_TABLES) or (own and not inner):
+        if not inner or own - set(_TABLES):
             return self.source
         if len(inner) > 1:
             raise MissingDataError(
@@ -161,7 +161,7 @@ class Scans(Converter):
                 found=f"the folders {', '.join(path.name for path in inner)}",
                 advice="give one of them, or the poses of several LiDARs with `calibration`",
             )
-        return inner[0] if inner else self.source
+        return inner[0]
 
     def _scans_in(self, folder: Path) -> list[Path]:
         """Return the files of a folder that may be scans, without those of poses and times."""
@@ -288,7 +288,7 @@ class ScanFolder(Recording):
         found = [PcdHeader.viewpoint]
         for path in self._paths:
             try:
-                found.append(read_header(path).viewpoint)
+                found.append(_header_of(path, _state(path)).viewpoint)
             except FormatError:
                 found.append(found[-1])  # reading its scan reports the error
         rows = np.array(found[1:], np.float64)
@@ -376,12 +376,8 @@ class ScanFolder(Recording):
         """
         found = dict[int, int]()
         for row, path in enumerate(self._paths):
-            with suppress(FormatError):
-                columns = read_columns(path, self._options.columns)
-                if (times := clock.of(columns)) is not None:
-                    seen = returns(columns)
-                    start = point_seconds(times, clock.unit, str(path), seen, absolute=True)[1]
-                    found |= {} if start is None else {row: start}
+            start = _start_of(path, _state(path), self._options.columns, clock)
+            found |= {} if start is None else {row: start}
         first = next(iter(found.values()))
         rows = np.arange(len(self._paths))
         known = list(found)
@@ -581,6 +577,32 @@ def _together(stamps: IntArray, poses: IntArray) -> bool:
 
 def _path(name: str | None) -> Path | None:
     return Path(name) if name else None
+
+
+def _state(path: Path) -> tuple[int, int]:
+    about = path.stat()
+    return about.st_size, about.st_mtime_ns
+
+
+# A growing folder is looked at again and again: the files that it had before are not read again.
+_remembered = lru_cache(maxsize=1 << 16)
+
+
+@_remembered
+def _header_of(path: Path, _: tuple[int, int]) -> PcdHeader:
+    return read_header(path)
+
+
+@_remembered
+def _start_of(
+    path: Path, _: tuple[int, int], names: tuple[str, ...] | None, clock: PointClock
+) -> int | None:
+    with suppress(FormatError):
+        columns = read_columns(path, names)
+        if (times := clock.of(columns)) is not None:
+            seen = returns(columns)
+            return point_seconds(times, clock.unit, str(path), seen, absolute=True)[1]
+    return None
 
 
 def _natural(path: Path) -> list[Any]:

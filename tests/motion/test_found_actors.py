@@ -10,7 +10,8 @@ from helpers.references.whole_drives import find_actors, link_segments
 from helpers.scenes.moving_scenes import CAR, PERSON, WALL, WALLS, box, car, film, person
 
 from carlasc.captures.settings import Lidar
-from carlasc.motion.evidence import FreeSpaceEvidence
+from carlasc.motion import found_actors
+from carlasc.motion.evidence import FreeSpaceEvidence, find_evidence
 from carlasc.motion.found_actors import ActorFollower
 from carlasc.motion.tracks import MovingActors
 
@@ -184,3 +185,21 @@ def test_a_rider_who_keeps_nearly_the_pace_beside_the_sensor_is_no_part_of_the_v
     found = find_actors(scan for scan, _ in filmed)
     (actor,) = found.tracked
     assert found.own == () and abs(actor.segments[0].velocity[0] - 6.1) < 0.3
+
+
+def test_actors_are_estimated_again_while_scans_come(monkeypatch):
+    """What is remembered of earlier estimates may be forgotten."""
+    monkeypatch.setattr(found_actors, "_BESIDE", 2)
+    filmed = film(
+        lambda t: [*WALLS, person(t + 0.3 * np.sin(t), -1.6), car(-16.0 + 8.0 * t, 6.0)],
+        40,
+        ego_m_s=1.0,
+    )
+    follower, made = ActorFollower(), set()
+    for evidence in find_evidence(scan for scan, _ in filmed):
+        actors = [*follower.add(evidence), *follower.again(evidence.seconds - 0.5, 1)]
+        made |= {actor.segments[0].instance for actor in actors}
+        follower.forget_before(evidence.frame - 20)
+        follower.find_own()
+    assert len(made) > 6 and len(made - follower.replaced) == 2
+    assert not follower.finish()[2:] and follower.own == []

@@ -24,7 +24,7 @@ from carlasc.core.arrays import (
     IntArray,
     LabelArray,
 )
-from carlasc.core.geometry import Transform, invert, moved_back, transform_points
+from carlasc.core.geometry import invert, moved_back, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan, check_finite, lengths, sorted_by_origin
 from carlasc.errors import FormatError, MissingDataError
@@ -150,7 +150,7 @@ class ScanFeed:
         self._lock = threading.RLock()  # an executor may be of threads
         self.key = uuid4().hex
         self.contents: dict[int, str] = {}
-        self.pose = cache(self._read_pose)
+        self.pose = cache(sequence.read_pose)
 
     def __reduce__(self) -> tuple[Callable[..., ScanFeed], tuple[Any, ...]]:
         return _restore, (self.key, without_caches(self.sequence), self.options)
@@ -181,12 +181,10 @@ class ScanFeed:
 
     def use(self, sequence: Sequence, frames: list[int]) -> None:
         """Read a sequence that has grown, and merge only these frames from now on."""
-        self.sequence, self.is_growing = sequence, True
-        self.frames = np.array(frames, np.int64)
+        if sequence is not self.sequence:
+            self.sequence, self.pose = sequence, cache(sequence.read_pose)
+        self.is_growing, self.frames = True, np.array(frames, np.int64)
         self.times = {frame: self.time(frame) for frame in frames}
-
-    def _read_pose(self, frame: int) -> Transform:
-        return self.sequence.read_pose(frame)  # which may be another one later: see `use`
 
     @cached_property
     def frames(self) -> IntArray:
