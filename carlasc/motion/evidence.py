@@ -255,12 +255,12 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     verdict = _judge(
         scan, candidates[asked_first], [window[i] for i in before], [window[i] for i in after]
     )
-    moved, left, static, stays = (answers[same] for answers in verdict)
+    moved, left, static, stays, held = (answers[same] for answers in verdict)
     kind = np.zeros(len(candidates), np.int64)
     if scan.labels is not None and movable:
         labels = scan.labels[candidates].astype(np.int64)
         kind = np.where(np.isin(labels, sorted(movable)), labels, 0)
-    groups = _clusters(world, kind, moved, left, static, stays)
+    groups = _clusters(world, kind, moved, left, static, stays, held)
     freed, passed = (
         tuple(int(flags[group].sum()) for group in groups) for flags in (moved | left, moved)
     )
@@ -270,7 +270,7 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
         0 if scan.labels is None else int(np.bincount(scan.labels[own]).argmax())
         for own in clusters
     ]
-    around = _count_around(world, groups, static)
+    around = _count_around(world, groups, static & ~held)
     parts = (tuple(clusters), tuple(points), tuple(classes), freed, passed, around)
     near = cells_around(scan.points[candidates])
     times = () if scan.times is None else tuple(scan.times[members] for members in clusters)
@@ -326,9 +326,10 @@ def _others(window: deque[_Kept], current: int) -> tuple[list[int], list[int]]:
 
 def _judge(
     scan: EvidenceScan, candidates: IntArray, before: list[_Kept], after: list[_Kept]
-) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
+) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray, BoolArray]:
     """Return which candidates are at places that were free most of the time, free on one side in
-    time, occupied (static), and occupied for seconds without ever being free.
+    time, occupied (static), occupied for seconds without ever being free, and occupied for a while
+    without a break, and free before or after.
     """
     points = np.ascontiguousarray(scan.points[candidates], np.float32)
     free, hit = np.zeros((2, 2, len(points)), np.uint32)
@@ -360,7 +361,8 @@ def _judge(
     moved = (seen_through >= _AGREEING) & (seen_through > occupied)
     left = ~moved & (in_a_row >= _IN_A_ROW)
     stays = (hit >> np.uint32(_LATE) > 0).any(axis=0) & (seen_through == 0)
-    return moved, left, ~(moved | left) & (occupied > seen_through), stays
+    held = ((free & smeared) == 0).all(axis=0) & (seen_through >= _AGREEING)
+    return moved, left, ~(moved | left) & (occupied > seen_through), stays, held
 
 
 def _clusters(
@@ -370,6 +372,7 @@ def _clusters(
     left: BoolArray,
     static: BoolArray,
     stays: BoolArray,
+    held: BoolArray,
 ) -> list[IntArray]:
     """Group moved points by cells, seen from above, and add the points around them that are not
     static.
@@ -383,6 +386,7 @@ def _clusters(
         static: (N,) points at places that were occupied at other times.
         stays: (N,) those among them at places that were occupied seconds before or after, and never
             free.
+        held: (N,) points at places that were occupied for a while only.
 
     Returns:
         Indices of the points of each cluster.
@@ -405,7 +409,11 @@ def _clusters(
     # One point that moved makes a cell a seed: such points are rare on static things. Points that
     # were free on one side only are common behind edges, so a cell needs a large share of them.
     seeds = (np.bincount(flat, moved[inside], minlength=len(keys)) > 0) | (share >= _FLAGGED_SHARE)
-    component = joined(keys, seeds, int(width))[flat]
+    # The side of a long or slow vehicle passes places that it held before.
+    sides = np.bincount(flat, held[inside], minlength=len(keys)) / np.bincount(
+        flat, minlength=len(keys)
+    ) >= _FLAGGED_SHARE
+    component = joined(keys, seeds | sides, int(width))[flat]
     groups: list[IntArray] = []
     kept = np.flatnonzero(component >= 0)
     order = kept[np.argsort(component[kept], kind="stable")]
@@ -419,7 +427,8 @@ def _clusters(
         # the places of its own earlier surface. What stays does not, and otherwise static points
         # are of something behind it.
         whole = count >= _FLAGGED_SHARE * np.count_nonzero(core)
-        members = members[~static[members] | (core & whole & ~stays[members])]
+        own = whole & (core & ~stays[members] | held[members])
+        members = members[~static[members] | own]
         groups.append(np.sort(members))
     return groups
 
