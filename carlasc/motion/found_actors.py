@@ -28,7 +28,15 @@ from carlasc.motion.evidence import (
     FreeSpaceEvidence,
     cells_around,
 )
-from carlasc.motion.paths import Path, Segment, is_static, middles_of, misalignment, path_of
+from carlasc.motion.paths import (
+    Path,
+    Segment,
+    is_static,
+    length_of,
+    middles_of,
+    misalignment,
+    path_of,
+)
 from carlasc.motion.planes import nearest_points
 from carlasc.motion.solving import best_pairs
 
@@ -81,6 +89,9 @@ _OWN_SHARE = 0.5  # an actor with so many points in these cells is none
 # A cluster is split between chains of so many observations, whose middles are expected so near to
 # it, and whose velocities differ by so much. So many points of their last ones stand for them.
 _KNOWN, _NEAR_M, _APART_M_S, _MODEL = 3, 0.2, 1.0, 80
+# A vehicle that is so long, and turns by so much, may have a joint: then points of its front are
+# so far beside its rear half. Shares of points beyond each end, and least number of points.
+_LONG_M, _BENDS_RAD, _ASIDE_M, _END, _MIN_PART = 9.0, 0.3, 0.3, 0.02, 10
 _KEPT = 400  # points of an observation that are kept
 _SAMPLES = 300  # points of an observation that are compared with those of another
 
@@ -242,8 +253,12 @@ class ActorFollower:
 
     def _actors(self, chains: list[_ActorChain]) -> list[FoundActor]:
         actors, ground_m = [], float(np.median(self._grounds or [np.nan]))
-        for one in chains:
+        waiting = chains[::-1]
+        while waiting:
+            one = waiting.pop()
             if actor := one.actor(self._deformable, self._number, self._label):
+                actor, ahead = one.split(actor)
+                waiting += ahead
                 actors.append(actor)
                 self._cells[self._number] = one.cells()
                 self._beside += [self._number] if one.is_beside(ground_m) else []
@@ -423,6 +438,45 @@ class _ActorChain:
         ]
         return FoundActor(parts, rigid, confidence, path)
 
+    def split(self, actor: FoundActor) -> tuple[FoundActor, list[_ActorChain]]:
+        """Split a vehicle with a joint, of which this is the actor: return its rear part, along the
+        path of its rear half, and the chain of what is then beside it, if any.
+        """
+        segments, path = actor.segments, actor.path
+        samples = [segment.points for segment in segments]
+        if path is None or length_of(samples) < _LONG_M or np.ptp(path[2]) < _BENDS_RAD:
+            return actor, []
+        along = [points[:, 0] for points in _in_body(samples, path)]
+        low, high = np.quantile(np.concatenate(along), (_END, 1 - _END))
+        rear = [own < (low + high) / 2 for own in along]
+        halves = [
+            replace(segment, points=segment.points[own])
+            for segment, own in zip(segments, rear, strict=True)
+        ]
+        seconds = np.array([link.seconds for link in self.links])
+        behind = path_of(halves, seconds, rigid=True)
+        across = [points[:, 1] for points in _in_body(samples, behind)]
+        shown = np.concatenate([y[own] for y, own in zip(across, rear, strict=True)])
+        low, high = np.quantile(shown, (_END, 1 - _END))
+        beside = [(y < low - _ASIDE_M) | (y > high + _ASIDE_M) for y in across]
+        parts = [
+            link.part(own)
+            for link, own in zip(self.links, beside, strict=True)
+            if own.sum() >= _MIN_PART
+        ]
+        if len(parts) < _MIN_OBSERVATIONS:
+            return actor, []
+        ahead = _ActorChain(parts[0])
+        for part in parts[1:]:
+            ahead.append(part)
+        left = [
+            replace(segment, members=link.part(~own).segment.members, points=segment.points[~own])
+            if _MIN_PART <= own.sum() < len(own)
+            else segment
+            for segment, link, own in zip(segments, self.links, beside, strict=True)
+        ]
+        return actor._replace(segments=left, path=behind), [ahead]
+
     def _confidence(
         self,
         samples: list[FloatArray],
@@ -516,6 +570,15 @@ class _ActorChain:
         x, y, z = np.concatenate(local).T
         slopes = np.quantile(z / np.maximum(np.hypot(x, y), 1e-3), (0.05, 0.95))
         return bool(stays and driven > _SENSOR_PATH_M and np.ptp(slopes) < _LINE_SLOPE)
+
+
+def _in_body(samples: list[FloatArray], path: Path) -> list[FloatArray]:
+    """Return the (M, 3) points of each observation of an actor, metres, actor frame."""
+    positions, _, headings = path
+    return [
+        multiply(points - place, rotation_z(heading)[:3, :3])
+        for points, place, heading in zip(samples, positions, headings, strict=True)
+    ]
 
 
 def _widened(cells: BoolArray) -> BoolArray:
