@@ -410,9 +410,11 @@ def _clusters(
     # were free on one side only are common behind edges, so a cell needs a large share of them.
     seeds = (np.bincount(flat, moved[inside], minlength=len(keys)) > 0) | (share >= _FLAGGED_SHARE)
     # The side of a long or slow vehicle passes places that it held before.
-    sides = np.bincount(flat, held[inside], minlength=len(keys)) / np.bincount(
-        flat, minlength=len(keys)
-    ) >= _FLAGGED_SHARE
+    sides = (
+        np.bincount(flat, held[inside], minlength=len(keys))
+        / np.bincount(flat, minlength=len(keys))
+        >= _FLAGGED_SHARE
+    )
     component = joined(keys, seeds | sides, int(width))[flat]
     groups: list[IntArray] = []
     kept = np.flatnonzero(component >= 0)

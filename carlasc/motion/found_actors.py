@@ -31,6 +31,7 @@ from carlasc.motion.evidence import (
 from carlasc.motion.paths import (
     Path,
     Segment,
+    estimate_path,
     is_static,
     length_of,
     middles_of,
@@ -439,41 +440,37 @@ class _ActorChain:
         return FoundActor(parts, rigid, confidence, path)
 
     def split(self, actor: FoundActor) -> tuple[FoundActor, list[_ActorChain]]:
-        """Split a vehicle with a joint, of which this is the actor: return its rear part, along the
-        path of its rear half, and the chain of what is then beside it, if any.
+        """Split a vehicle with a joint, of which this is the actor: return what follows the path of
+        its rear half, and the chain of what is beside that, if any.
         """
         segments, path = actor.segments, actor.path
         samples = [segment.points for segment in segments]
         if path is None or length_of(samples) < _LONG_M or np.ptp(path[2]) < _BENDS_RAD:
             return actor, []
         along = [points[:, 0] for points in _in_body(samples, path)]
-        low, high = np.quantile(np.concatenate(along), (_END, 1 - _END))
-        rear = [own < (low + high) / 2 for own in along]
-        halves = [
-            replace(segment, points=segment.points[own])
-            for segment, own in zip(segments, rear, strict=True)
-        ]
+        middle = np.quantile(np.concatenate(along), (_END, 1 - _END)).mean()
+        rear = [own < middle for own in along]
+        halves = [points[own] for points, own in zip(samples, rear, strict=True)]
         seconds = np.array([link.seconds for link in self.links])
-        behind = path_of(halves, seconds, rigid=True)
+        behind = estimate_path(halves, seconds, rigid=True)
         across = [points[:, 1] for points in _in_body(samples, behind)]
         shown = np.concatenate([y[own] for y, own in zip(across, rear, strict=True)])
         low, high = np.quantile(shown, (_END, 1 - _END))
         beside = [(y < low - _ASIDE_M) | (y > high + _ASIDE_M) for y in across]
-        parts = [
-            link.part(own)
-            for link, own in zip(self.links, beside, strict=True)
-            if own.sum() >= _MIN_PART
-        ]
+        both = list(zip(segments, self.links, beside, strict=True))
+        parts = [link.part(own) for _, link, own in both if own.sum() >= _MIN_PART]
         if len(parts) < _MIN_OBSERVATIONS:
             return actor, []
         ahead = _ActorChain(parts[0])
         for part in parts[1:]:
             ahead.append(part)
         left = [
-            replace(segment, members=link.part(~own).segment.members, points=segment.points[~own])
-            if _MIN_PART <= own.sum() < len(own)
-            else segment
-            for segment, link, own in zip(segments, self.links, beside, strict=True)
+            segment
+            if own.all()
+            else replace(
+                segment, members=link.part(~own).segment.members, points=segment.points[~own]
+            )
+            for segment, link, own in both
         ]
         return actor._replace(segments=left, path=behind), [ahead]
 
@@ -574,10 +571,9 @@ class _ActorChain:
 
 def _in_body(samples: list[FloatArray], path: Path) -> list[FloatArray]:
     """Return the (M, 3) points of each observation of an actor, metres, actor frame."""
-    positions, _, headings = path
     return [
         multiply(points - place, rotation_z(heading)[:3, :3])
-        for points, place, heading in zip(samples, positions, headings, strict=True)
+        for points, place, heading in zip(samples, path[0], path[2], strict=True)
     ]
 
 
