@@ -54,7 +54,7 @@ _ASIDE = 0.1  # weight of an end that is not turned to the sensor
 _AGREE_M = 0.5  # an end that is farther from its usual place is that of a part of the actor
 _ROUNDS, _TURNS_RAD = 3, 0.1
 _SURELY = 0.8  # a vehicle does what is less usual if its ends agree better by this factor
-_ENDS_M = 0.25  # only ends that agree so well show it
+_ENDS_M = 0.25  # and in reverse only if they agree so well
 _SETTLED_S, _SETTLED_POINTS = 1.5, 200  # positions change over so long; no scan weighs more
 FIRST_FOUND = 1 << 33  # found actors are numbered from here, above all instances
 _FORMATS = {
@@ -354,9 +354,12 @@ def _turned(
     ways[2] += np.pi
     places, errors = zip(*(_anchor(chain, positions, way) for way in ways), strict=True)
     way = 2 if errors[2] < min(_SURELY * errors[1], _ENDS_M**2) else 1
-    agree = errors[way] < _ENDS_M**2
-    if errors[0] < errors[way] * (_SURELY if agree else 1 / _SURELY):
-        way = 0
+    if errors[way] > _SURELY * errors[0]:
+        # its ends agree as well if it points to where it moves: registration shows how it turns
+        turns = path_of(chain, seconds, rigid=True)[2]
+        aside = [np.abs(np.sin(ways[k] - turns)).mean() for k in (0, way)]
+        if errors[0] < _SURELY * errors[way] or aside[0] < aside[1]:
+            way = 0
     return places[way], ways[way]
 
 
