@@ -59,6 +59,7 @@ _BAND_M = (
     0.3  # static points so far below or above a cluster, in its cells or beside them, are around it
 )
 _FLAGGED_SHARE = 0.6  # a cluster with this share of moved points moved as a whole
+_LONG_M = 4.5  # longer things pass places that they held
 _PERIOD_S = 0.1  # period of scans whose times do not increase
 _AROUND_M = 6.0  # ground so near to the sensor, along each axis, gives its height
 OWN_CELL_M, OWN_CELLS = 0.2, 40
@@ -429,7 +430,8 @@ def _clusters(
         # the places of its own earlier surface. What stays does not, and otherwise static points
         # are of something behind it.
         whole = count >= _FLAGGED_SHARE * np.count_nonzero(core)
-        own = whole & (core & ~stays[members] | held[members])
+        is_long = np.ptp(world[members[either[members]], :2], axis=0).max() > _LONG_M
+        own = whole & (core & ~stays[members] | held[members] & is_long)
         members = members[~static[members] | own]
         groups.append(np.sort(members))
     return groups
