@@ -59,7 +59,6 @@ _BAND_M = (
     0.3  # static points so far below or above a cluster, in its cells or beside them, are around it
 )
 _FLAGGED_SHARE = 0.6  # a cluster with this share of moved points moved as a whole
-_LONG_M = 4.5  # longer things pass places that they held
 _PERIOD_S = 0.1  # period of scans whose times do not increase
 _AROUND_M = 6.0  # ground so near to the sensor, along each axis, gives its height
 OWN_CELL_M, OWN_CELLS = 0.2, 40
@@ -256,12 +255,12 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     verdict = _judge(
         scan, candidates[asked_first], [window[i] for i in before], [window[i] for i in after]
     )
-    moved, left, static, stays, held = (answers[same] for answers in verdict)
+    moved, left, static, stays = (answers[same] for answers in verdict)
     kind = np.zeros(len(candidates), np.int64)
     if scan.labels is not None and movable:
         labels = scan.labels[candidates].astype(np.int64)
         kind = np.where(np.isin(labels, sorted(movable)), labels, 0)
-    groups = _clusters(world, kind, moved, left, static, stays, held)
+    groups = _clusters(world, kind, moved, left, static, stays)
     freed, passed = (
         tuple(int(flags[group].sum()) for group in groups) for flags in (moved | left, moved)
     )
@@ -271,7 +270,7 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
         0 if scan.labels is None else int(np.bincount(scan.labels[own]).argmax())
         for own in clusters
     ]
-    around = _count_around(world, groups, static & ~held)
+    around = _count_around(world, groups, static)
     parts = (tuple(clusters), tuple(points), tuple(classes), freed, passed, around)
     near = cells_around(scan.points[candidates])
     times = () if scan.times is None else tuple(scan.times[members] for members in clusters)
@@ -327,10 +326,9 @@ def _others(window: deque[_Kept], current: int) -> tuple[list[int], list[int]]:
 
 def _judge(
     scan: EvidenceScan, candidates: IntArray, before: list[_Kept], after: list[_Kept]
-) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray, BoolArray]:
+) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
     """Return which candidates are at places that were free most of the time, free on one side in
-    time, occupied (static), occupied for seconds without ever being free, and occupied for a while
-    without a break, and free before or after.
+    time, occupied (static), and occupied for seconds without ever being free.
     """
     points = np.ascontiguousarray(scan.points[candidates], np.float32)
     free, hit = np.zeros((2, 2, len(points)), np.uint32)
@@ -362,8 +360,7 @@ def _judge(
     moved = (seen_through >= _AGREEING) & (seen_through > occupied)
     left = ~moved & (in_a_row >= _IN_A_ROW)
     stays = (hit >> np.uint32(_LATE) > 0).any(axis=0) & (seen_through == 0)
-    held = ((free & smeared) == 0).all(axis=0) & (seen_through >= _AGREEING)
-    return moved, left, ~(moved | left) & (occupied > seen_through), stays, held
+    return moved, left, ~(moved | left) & (occupied > seen_through), stays
 
 
 def _clusters(
@@ -373,7 +370,6 @@ def _clusters(
     left: BoolArray,
     static: BoolArray,
     stays: BoolArray,
-    held: BoolArray,
 ) -> list[IntArray]:
     """Group moved points by cells, seen from above, and add the points around them that are not
     static.
@@ -387,7 +383,6 @@ def _clusters(
         static: (N,) points at places that were occupied at other times.
         stays: (N,) those among them at places that were occupied seconds before or after, and never
             free.
-        held: (N,) points at places that were occupied for a while only.
 
     Returns:
         Indices of the points of each cluster.
@@ -410,13 +405,7 @@ def _clusters(
     # One point that moved makes a cell a seed: such points are rare on static things. Points that
     # were free on one side only are common behind edges, so a cell needs a large share of them.
     seeds = (np.bincount(flat, moved[inside], minlength=len(keys)) > 0) | (share >= _FLAGGED_SHARE)
-    # The side of a long or slow vehicle passes places that it held before.
-    sides = (
-        np.bincount(flat, held[inside], minlength=len(keys))
-        / np.bincount(flat, minlength=len(keys))
-        >= _FLAGGED_SHARE
-    )
-    component = joined(keys, seeds | sides, int(width))[flat]
+    component = joined(keys, seeds, int(width))[flat]
     groups: list[IntArray] = []
     kept = np.flatnonzero(component >= 0)
     order = kept[np.argsort(component[kept], kind="stable")]
@@ -430,9 +419,7 @@ def _clusters(
         # the places of its own earlier surface. What stays does not, and otherwise static points
         # are of something behind it.
         whole = count >= _FLAGGED_SHARE * np.count_nonzero(core)
-        is_long = np.ptp(world[members[either[members]], :2], axis=0).max() > _LONG_M
-        own = whole & (core & ~stays[members] | held[members] & is_long)
-        members = members[~static[members] | own]
+        members = members[~static[members] | (core & whole & ~stays[members])]
         groups.append(np.sort(members))
     return groups
 
