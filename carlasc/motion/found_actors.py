@@ -462,16 +462,12 @@ class _ActorChain:
         if len(parts) < _MIN_OBSERVATIONS:
             return actor, []
         ahead = _ActorChain(parts[0])
-        for part in parts[1:]:
-            ahead.append(part)
-        left = [
-            segment
-            if own.all()
-            else replace(
-                segment, members=link.part(~own).segment.members, points=segment.points[~own]
-            )
-            for segment, link, own in both
-        ]
+        ahead.links = parts
+        left = list[Segment]()
+        for segment, link, own in both:
+            kept = ~own | own.all()
+            members = link.part(kept).segment.members
+            left.append(replace(segment, members=members, points=segment.points[kept]))
         return actor._replace(segments=left, path=behind), [ahead]
 
     def _confidence(
