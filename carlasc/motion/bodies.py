@@ -190,7 +190,11 @@ class Sizes:
         for label, shapes in self._shapes.items():
             own = [(e, surface) for other, e, surface in examples if other == label]
             self._known[label] = np.array(
-                [e.size for e, _ in own if all(e.known + e.plausible)]
+                [
+                    e.size
+                    for e, _ in own
+                    if all(e.known + e.plausible) and _without_neighbours(e) is e
+                ]
             ).reshape(-1, 3)
             shapes += [(e, surface) for e, surface in own if e.exemplary and len(surface)]
 

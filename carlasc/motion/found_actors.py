@@ -28,7 +28,16 @@ from carlasc.motion.evidence import (
     FreeSpaceEvidence,
     cells_around,
 )
-from carlasc.motion.paths import Path, Segment, is_static, middles_of, misalignment, path_of
+from carlasc.motion.paths import (
+    Path,
+    Segment,
+    estimate_path,
+    is_static,
+    length_of,
+    middles_of,
+    misalignment,
+    path_of,
+)
 from carlasc.motion.planes import nearest_points
 from carlasc.motion.solving import best_pairs
 
@@ -81,6 +90,9 @@ _OWN_SHARE = 0.5  # an actor with so many points in these cells is none
 # A cluster is split between chains of so many observations, whose middles are expected so near to
 # it, and whose velocities differ by so much. So many points of their last ones stand for them.
 _KNOWN, _NEAR_M, _APART_M_S, _MODEL = 3, 0.2, 1.0, 80
+# A vehicle that is so long, and turns by so much, may have a joint: then points of its front are
+# so far beside its rear half. Shares of points beyond each end, and least number of points.
+_LONG_M, _BENDS_RAD, _ASIDE_M, _END, _MIN_PART = 9.0, 0.3, 0.3, 0.02, 10
 _KEPT = 400  # points of an observation that are kept
 _SAMPLES = 300  # points of an observation that are compared with those of another
 
@@ -255,12 +267,18 @@ class ActorFollower:
 
     def _actors(self, chains: list[_ActorChain]) -> list[FoundActor]:
         actors, ground_m = [], float(np.median(self._grounds or [np.nan]))
+        waiting = chains[::-1]
         for one in chains:
-            self.replaced.add(one.number)
-            one.number, one.estimated_s = 0, one.last.seconds
+            self.replaced |= one.numbers
+            one.numbers.clear()
+            one.estimated_s = one.last.seconds
+        while waiting:
+            one = waiting.pop()
             if actor := one.actor(self._deformable, self._number, self._label):
+                actor, ahead = one.split(actor)
+                waiting += ahead
                 actors.append(actor)
-                one.number = self._number
+                one.numbers.add(self._number)
                 self._cells[self._number] = one.cells()
                 self._beside += [self._number] if one.is_beside(ground_m) else []
                 self._number += 1
@@ -359,8 +377,9 @@ class _ActorChain:
 
     def __init__(self, first: _Link) -> None:
         self.links = [first]
-        # number of its last estimate, and its last observation then; before: 0, and the first one
-        self.number, self.estimated_s = 0, first.seconds
+        # numbers of its last estimate and of the parts that were split from it
+        self.numbers: set[int] = set()
+        self.estimated_s = first.seconds  # of its last observation then; before: of the first one
         self.velocity: FloatArray | None = (
             None  # (3,) m/s over the last observations; None for a single one
         )
@@ -440,6 +459,38 @@ class _ActorChain:
             for segment, velocity in zip(segments, velocities, strict=True)
         ]
         return FoundActor(parts, rigid, confidence, path)
+
+    def split(self, actor: FoundActor) -> tuple[FoundActor, list[_ActorChain]]:
+        """Split a vehicle with a joint, of which this is the actor: return what follows the path of
+        its rear half, and the chain of what is beside that, if any.
+        """
+        segments, path = actor.segments, actor.path
+        samples = [segment.points for segment in segments]
+        if path is None or length_of(samples) < _LONG_M or np.ptp(path[2]) < _BENDS_RAD:
+            return actor, []
+        along = [points[:, 0] for points in _in_body(samples, path)]
+        middle = np.quantile(np.concatenate(along), (_END, 1 - _END)).mean()
+        rear = [own < middle for own in along]
+        halves = [points[own] for points, own in zip(samples, rear, strict=True)]
+        seconds = np.array([link.seconds for link in self.links])
+        behind = estimate_path(halves, seconds, rigid=True)
+        across = [points[:, 1] for points in _in_body(samples, behind)]
+        shown = np.concatenate([y[own] for y, own in zip(across, rear, strict=True)])
+        low, high = np.quantile(shown, (_END, 1 - _END))
+        beside = [(y < low - _ASIDE_M) | (y > high + _ASIDE_M) for y in across]
+        both = list(zip(segments, self.links, beside, strict=True))
+        parts = [link.part(own) for _, link, own in both if own.sum() >= _MIN_PART]
+        if len(parts) < _MIN_OBSERVATIONS:
+            return actor, []
+        ahead = _ActorChain(parts[0])
+        ahead.links = parts
+        ahead.numbers = self.numbers
+        left = list[Segment]()
+        for segment, link, own in both:
+            kept = ~own | own.all()
+            members = link.part(kept).segment.members
+            left.append(replace(segment, members=members, points=segment.points[kept]))
+        return actor._replace(segments=left, path=behind), [ahead]
 
     def _confidence(
         self,
@@ -534,6 +585,14 @@ class _ActorChain:
         x, y, z = np.concatenate(local).T
         slopes = np.quantile(z / np.maximum(np.hypot(x, y), 1e-3), (0.05, 0.95))
         return bool(stays and driven > _SENSOR_PATH_M and np.ptp(slopes) < _LINE_SLOPE)
+
+
+def _in_body(samples: list[FloatArray], path: Path) -> list[FloatArray]:
+    """Return the (M, 3) points of each observation of an actor, metres, actor frame."""
+    return [
+        multiply(points - place, rotation_z(heading)[:3, :3])
+        for points, place, heading in zip(samples, path[0], path[2], strict=True)
+    ]
 
 
 def _widened(cells: BoolArray) -> BoolArray:

@@ -13,6 +13,7 @@ not.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -47,6 +48,7 @@ _MIN_TURNS = 4  # least number of such directions
 _REAR_AXLE, _MOST_ASIDE = 0.3, 0.5
 # Changes by less are noise; least share in reverse, of a vehicle that turns by so much.
 _STEADY_RAD, _REVERSE, _BEND_RAD = 0.06, 0.4, 0.5
+_CLEAR = 0.5  # sides of a vehicle are at right angles: their normals agree by so much
 
 _INITIAL_S = 0.5  # half width of the window for the initial estimate of the motion
 _REGISTERED = 300  # number of points of an observation that are registered to the model
@@ -162,17 +164,20 @@ def estimate_path(
     if after is not None and not rigid:
         walked = smooth(middles_of(chosen), at, weights, _WALK_S)[1]
         chosen = [moved_back(*seen) for seen in zip(chosen, after, walked, strict=True)]
-    path, turns = follow(chosen, at, best, after) if rigid else (middles_of(chosen), None)
+    path, turns, sides = (
+        follow(chosen, at, best, after) if rigid else (middles_of(chosen), None, math.nan)
+    )
     positions, velocities = smooth(path, at, weights, _DRIVE_S if rigid else _WALK_S)
     positions, velocities = resample(
         seconds, at, positions, _limit_acceleration(velocities, at, best)
     )
     if turns is None:
         return positions, velocities, headings_of(velocities)
+    turns, length_m = np.interp(seconds, at, turns), length_of(chosen)
     return (
         positions,
         velocities,
-        headings_of_vehicle(velocities, seconds, length_of(chosen), np.interp(seconds, at, turns)),
+        headings_of_vehicle(velocities, seconds, length_m, turns, sides),
     )
 
 
@@ -255,6 +260,7 @@ def headings_of_vehicle(
     seconds: FloatArray,
     length_m: float,
     turns: FloatArray | None = None,
+    sides: float = math.nan,
 ) -> FloatArray:
     """Return the headings of a vehicle, which moves ahead or in reverse.
 
@@ -264,8 +270,10 @@ def headings_of_vehicle(
     Args:
         velocities: (F, 3) m/s.
         seconds: (F,) times, rising.
-        length_m: visible length of the vehicle; 0: its centre does not move aside.
+        length_m: visible length of the vehicle; 0: its centre does not move aside; negative: it
+            moves aside as in reverse.
         turns: (F,) registered headings, except for a constant, radians; None: they are unknown.
+        sides: this constant, except for quarters of a turn, radians; NaN: it is unknown.
 
     Returns:
         (F,) radians, unwrapped; those of `headings_of` if few velocities are fast enough.
@@ -289,6 +297,9 @@ def headings_of_vehicle(
         return np.interp(np.arange(len(velocities)), fast, left - aside)
     # Registration shows how far aside it moves, and whether it is in reverse: then the other way.
     change, moved = aside - aside.mean(), left - left.mean()
+    if not math.isnan(sides):
+        quarters = np.round((left.mean() - sides) / (np.pi / 2))
+        change, moved = aside, left - sides - quarters * np.pi / 2
     share = float((change * moved).sum() / (np.square(change) + _STEADY_RAD**2).sum())
     if share < -_REVERSE and np.ptp(turns) > _BEND_RAD:
         left = left + np.pi
@@ -307,7 +318,7 @@ def follow(
     seconds: FloatArray,
     best: int,
     delays: Sequence[AnyFloatArray | None] | None = None,
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, float]:
     """Register the observations of a rigid, upright actor, from the best observation outwards.
 
     Args:
@@ -318,8 +329,9 @@ def follow(
             moved to the time of their observation by the motion so far.
 
     Returns:
-        (F, 3) centre of the actor, metres, world, and its (F,) heading, radians, 0 in the best
-        observation.
+        (F, 3) centre of the actor, metres, world, its (F,) heading, radians, 0 in the best
+        observation, and the direction of its sides then, except for quarters of a turn; NaN if it
+        shows none.
     """
     counts = np.array([len(points) for points in observations])
     middles, seen_at = middles_of(observations), list(observations)
@@ -352,7 +364,20 @@ def follow(
             model.add(transform_points(invert(pose_of(states[index])), points))
             previous, seen = index, seen + 1
     middle = (np.quantile(model.points, 0.01, axis=0) + np.quantile(model.points, 0.99, axis=0)) / 2
-    return np.stack([transform_points(pose_of(state), middle) for state in states]), states[:, 3]
+    path = np.stack([transform_points(pose_of(state), middle) for state in states])
+    return path, states[:, 3], _sides_of(model)
+
+
+def _sides_of(model: Planes) -> float:
+    """Return the direction to which most sides of an actor are at right angles, except for quarters
+    of a turn, radians; NaN without any.
+    """
+    x, y, _ = model.normals.T
+    # four times the angle: normals of all four sides are alike
+    weight, angle = np.hypot(x, y), 4 * np.arctan2(y, x)
+    across, along = (float((weight * part(angle)).sum()) for part in (np.sin, np.cos))
+    clear = math.hypot(across, along) > _CLEAR * weight.sum()
+    return math.atan2(across, along) / 4 if clear else math.nan
 
 
 def corrections(

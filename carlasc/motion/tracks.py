@@ -53,7 +53,8 @@ _END = 0.02  # share of the points of a scan beyond each end of what it shows
 _ASIDE = 0.1  # weight of an end that is not turned to the sensor
 _AGREE_M = 0.5  # an end that is farther from its usual place is that of a part of the actor
 _ROUNDS, _TURNS_RAD = 3, 0.1
-_SURELY = 0.8  # a vehicle turns around its rear axle if its ends agree better by this factor
+_SURELY = 0.8  # a vehicle does what is less usual if its ends agree better by this factor
+_ENDS_M = 0.25  # and in reverse only if they agree so well
 _SETTLED_S, _SETTLED_POINTS = 1.5, 200  # positions change over so long; no scan weighs more
 FIRST_FOUND = 1 << 33  # found actors are numbered from here, above all instances
 _FORMATS = {
@@ -193,15 +194,9 @@ def make_track(
         positions = _integrate(velocities, seconds, chain)
         headings = headings_of(velocities)
         if keeps_shape:
-            length_m = length_of([segment.points for segment in chain])
-            headings, around_axle = (
-                headings_of_vehicle(velocities, seconds, length) for length in (0.0, length_m)
-            )
+            headings = headings_of_vehicle(velocities, seconds, 0.0)
             if np.ptp(headings) > _TURNS_RAD:
-                place, error = _anchor(chain, positions, headings)
-                other, least = _anchor(chain, positions, around_axle)
-                is_better = least < _SURELY * error
-                positions, headings = (other, around_axle) if is_better else (place, headings)
+                positions, headings = _turned(chain, positions, velocities, seconds)
     positions, extent, body = _fit_box(chain, positions, headings)
     frames, at = _frames_around(chain[0].frame, chain[-1].frame, times)
     places, speed = resample(at, seconds, positions, velocities)
@@ -347,6 +342,26 @@ def _anchor(
             root = np.sqrt(weights.reshape(-1, 1) / (1 + (error / _AGREE_M) ** 2))
         moved = moved + np.append(fit[4:, 0], 0.0)
     return moved, float(np.square(error * root).sum() / np.square(root).sum())
+
+
+def _turned(
+    chain: Sequence[Segment], positions: FloatArray, velocities: FloatArray, seconds: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the positions and the headings of an actor that turns, from its flow: around its rear
+    axle, ahead or in reverse, or as it moves. Its ends decide.
+    """
+    length_m = length_of([segment.points for segment in chain])
+    ways = [headings_of_vehicle(velocities, seconds, long) for long in (0.0, length_m, -length_m)]
+    ways[2] += np.pi
+    places, errors = zip(*(_anchor(chain, positions, way) for way in ways), strict=True)
+    way = 2 if errors[2] < min(_SURELY * errors[1], _ENDS_M**2) else 1
+    if errors[way] > _SURELY * errors[0]:
+        # its ends agree as well if it points to where it moves: registration shows how it turns
+        turns = path_of(chain, seconds, rigid=True)[2]
+        aside = [np.abs(np.sin(ways[k] - turns)).mean() for k in (0, way)]
+        if errors[0] < _SURELY * errors[way] or aside[0] < aside[1]:
+            way = 0
+    return places[way], ways[way]
 
 
 def _fit_box(

@@ -143,6 +143,16 @@ def test_a_vehicle_that_goes_back_and_forth_keeps_its_front(is_registered):
     assert np.abs(np.angle(np.exp(1j * (headings_of(velocities) - headings)))).max() > 2.9
 
 
+@pytest.mark.parametrize("speed", [-4.0, 4.0])
+def test_sides_show_where_a_vehicle_points_in_a_steady_circle(speed):
+    headings, velocities = manoeuvre(*np.tile([[speed], [0.6]], len(SECONDS)))
+    sides = headings[0] - np.pi / 2  # a quarter of a turn does not matter
+    found = headings_of_vehicle(velocities, SECONDS, 5.0, headings - headings[0], sides)
+    assert np.abs(np.angle(np.exp(1j * (found - headings)))).max() < 0.1
+    reverse = headings_of_vehicle(velocities, SECONDS, np.sign(speed) * 5.0) + (speed < 0) * np.pi
+    assert np.abs(np.angle(np.exp(1j * (reverse - headings)))).max() < 0.02
+
+
 def test_registration_shows_that_a_vehicle_is_in_reverse_in_a_bend():
     rates = np.where(SECONDS[-1] / 2 > SECONDS, 0.0, 0.6)
     headings, velocities = manoeuvre(np.full(len(SECONDS), -4.0), rates)
@@ -193,7 +203,7 @@ class TestStatic:
 def test_a_path_goes_on_evenly_on_both_sides_of_where_it_starts():
     actor = MovingBox((10, 6, 0), speed=8.0)
     observations = observations_of(actor)
-    path, _ = follow(observations, SECONDS, best_observation(observations))
+    path, *_ = follow(observations, SECONDS, best_observation(observations))
     assert np.abs(np.diff(path, axis=0) - (0.8, 0, 0)).max() < 0.1
 
 
