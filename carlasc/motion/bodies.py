@@ -37,7 +37,7 @@ _ACTORS_WIDE_M = 1.3  # narrower vehicles have two wheels
 # Of cars, and of longer or higher vehicles: wider ones have points of a neighbour, or are smeared.
 # They are cut to the usual width, gradually over this width.
 _WIDEST_M, _CUT_M = (2.1, 2.6), 0.3
-# The ground below a vehicle may be higher by the first share of its distance, and not by the second.
+# By the first share of its distance, the ground below a vehicle may be higher, not by the second.
 _SLOPE = 0.04, 0.08
 _LOWEST_M = 1.0  # of lower ones, only a part was seen
 
