@@ -24,7 +24,7 @@ _FACE_POINTS, _FACE_SHARE = (
 _FACE_SINE = 0.26  # a scan sees a face if its rays meet the face at 15 degrees or more
 # The slopes of neighbouring channels differ by more. Where the channel above passed lower than the
 # top less this error, a scan shows a part of the actor; of the others, this quantile counts.
-_CHANNELS, _TOP_M, _LOW = 0.002, 0.05, 0.25
+_CHANNELS, _TOP_M, _LOW = 0.003, 0.05, 0.25
 _ALIKE = 0.15  # actors are similar if their known sizes differ by this fraction
 # No vehicle is shorter, or narrower, than these shares of the usual size of its kind; from the
 # second share on, all of it was seen.
@@ -161,8 +161,9 @@ def measure(points: FloatArray, counts: AnyIntArray, sensors: FloatArray) -> Ext
     lower, upper = np.quantile(points, (_TRIM, 1 - _TRIM), axis=0)
     scans = zip(np.split(points, np.cumsum(counts)[:-1]), sensors, strict=True)
     passed = [
-        _passed_above(seen[seen[:, 2] < upper[2] + _TOP_M] - sensor) + sensor[2]
+        _passed_above(part - sensor) + sensor[2]
         for seen, sensor in scans
+        if len(part := seen[seen[:, 2] < upper[2] + _TOP_M])
     ]
     # The top is halfway from the highest ray on the actor to a low one that passed above it.
     above = [height for height in passed if height > upper[2] - _TOP_M]
@@ -179,12 +180,11 @@ def _passed_above(seen: FloatArray) -> float:
     """
     x, y, z = seen.T
     distance, azimuth = np.maximum(np.hypot(x, y), 1e-6), np.arctan2(y, x)
-    order = np.argsort(-z / distance)
-    channel = np.cumsum(np.diff((-z / distance)[order]) > _CHANNELS)
-    second = order[1:][channel == 1]
-    if not len(second):
+    slopes, top = z / distance, int(np.argmax(z / distance))
+    lower = np.flatnonzero(slopes < slopes[top] - _CHANNELS)
+    if not len(lower):
         return -np.inf
-    top = order[0]
+    second = lower[slopes[lower] > slopes[lower].max() - _CHANNELS]
     beside = second[np.argmin(np.abs(azimuth[second] - azimuth[top]))]
     rise = z[top] - z[beside] - abs(distance[top] - distance[beside])
     return float(z[top] + max(rise, 0.0))
