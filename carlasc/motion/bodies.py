@@ -22,9 +22,6 @@ _FACE_POINTS, _FACE_SHARE = (
     0.02,
 )
 _FACE_SINE = 0.26  # a scan sees a face if its rays meet the face at 15 degrees or more
-# The slopes of neighbouring channels differ by more. Where the channel above passed lower than the
-# top less this error, a scan shows a part of the actor; of the others, this quantile counts.
-_CHANNELS, _TOP_M, _LOW = 0.003, 0.05, 0.25
 _ALIKE = 0.15  # actors are similar if their known sizes differ by this fraction
 # No vehicle is shorter, or narrower, than these shares of the usual size of its kind; from the
 # second share on, all of it was seen.
@@ -159,35 +156,7 @@ def measure(points: FloatArray, counts: AnyIntArray, sensors: FloatArray) -> Ext
         sensors: (F, 3) position of the sensor in each scan, metres, actor frame.
     """
     lower, upper = np.quantile(points, (_TRIM, 1 - _TRIM), axis=0)
-    scans = zip(np.split(points, np.cumsum(counts)[:-1]), sensors, strict=True)
-    passed = [
-        _passed_above(part - sensor) + sensor[2]
-        for seen, sensor in scans
-        if len(part := seen[seen[:, 2] < upper[2] + _TOP_M])
-    ]
-    # The top is halfway from the highest ray on the actor to a low one that passed above it.
-    above = [height for height in passed if height > upper[2] - _TOP_M]
-    upper[2] = (upper[2] + np.quantile(above or upper[2], _LOW)) / 2
     return seen_from(lower, upper, counts, sensors)
-
-
-def _passed_above(seen: FloatArray) -> float:
-    """Return the height, metres, at which the channel above those of a scan passed an actor, if its
-    surface rises on as steeply; -inf if one channel saw it.
-
-    Args:
-        seen: (M, 3) points of the actor, metres, from the sensor.
-    """
-    x, y, z = seen.T
-    distance, azimuth = np.maximum(np.hypot(x, y), 1e-6), np.arctan2(y, x)
-    slopes, top = z / distance, int(np.argmax(z / distance))
-    lower = np.flatnonzero(slopes < slopes[top] - _CHANNELS)
-    if not len(lower):
-        return -np.inf
-    second = lower[slopes[lower] > slopes[lower].max() - _CHANNELS]
-    beside = second[np.argmin(np.abs(azimuth[second] - azimuth[top]))]
-    rise = z[top] - z[beside] - abs(distance[top] - distance[beside])
-    return float(z[top] + max(rise, 0.0))
 
 
 def seen_from(

@@ -44,18 +44,6 @@ def test_a_sensor_sees_the_faces_that_are_turned_to_it(sensor, faces):
     assert np.allclose(found.size, (4.0, 1.8, 1.5), atol=0.15)
 
 
-@pytest.mark.parametrize(
-    ("leans", "top"), [(0.0, 1.0), (1.0, 0.8)], ids=["a wall goes on", "a roof ends"]
-)
-def test_the_top_is_halfway_to_the_channel_that_passed_above(leans, top):
-    y = np.linspace(-0.9, 0.9, 50)
-    channels = [
-        np.column_stack([np.full(50, leans * z), y, np.full(50, z)]) for z in (0.0, 0.4, 0.8)
-    ]
-    found = measured([np.concatenate(channels)], np.array([[-20.0, 0, 0.3]]))
-    assert found.upper[2] == pytest.approx(top, abs=0.02)
-
-
 def test_a_face_counts_from_twelve_points_and_two_percent_of_them():
     sensors = np.array([[-20.0, 0, 1], [0, 20.0, 1]])
     for points, seen in ((11, False), (12, True)):
