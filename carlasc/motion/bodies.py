@@ -37,13 +37,15 @@ _ACTORS_WIDE_M = 1.3  # narrower vehicles have two wheels
 # Of cars, and of longer or higher vehicles: wider ones have points of a neighbour, or are smeared.
 # They are cut to the usual width, gradually over this width.
 _WIDEST_M, _CUT_M = (2.1, 2.6), 0.3
+# By the first share of its distance, the ground below a vehicle may be higher, not by the second.
+_SLOPE = 0.04, 0.08
 _LOWEST_M = 1.0  # of lower ones, only a part was seen
 
 BODY_MARGIN_M = 0.1  # margin of the box of an actor around its body
 _CLEARANCE_M, _SPACING_M = 0.15, 0.1
-_INSET_M = (
-    0.22  # depth of the usual shell inside the box: an occupied voxel holds some depth of the body
-)
+# Depth of the usual shell inside the box, and of a learned surface inside the body: an occupied
+# voxel holds some depth of the body.
+_INSET_M, _LEARNED_INSET_M = 0.22, 0.06
 # Of a car, as fractions: the height of its body, the ends and the width of its cabin.
 _BELT, _CABIN, _CABIN_WIDE = 0.62, (0.08, 0.75), 0.85
 
@@ -84,19 +86,25 @@ class Extent:
         faces: whether the rear, the front, the side of low y and the side of high y are visible in
             some scan.
         points: number of points of the observations.
-        seen_from: x and y of the sensor, metres, actor frame: mean over the points.
+        seen_from: (3,) where the sensor is from the middle of the box, metres, actor frame: mean
+            over the points.
     """
 
     lower: FloatArray
     upper: FloatArray
     faces: tuple[bool, bool, bool, bool]
     points: int
-    seen_from: tuple[float, float] = (0.0, 0.0)
+    seen_from: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def size(self) -> FloatArray:
         """(3,) metres: length, width and height of the visible part."""
         return self.upper - self.lower
+
+    @property
+    def below_sensor_m(self) -> float:
+        """How far its lower end is below the sensor, metres."""
+        return float(self.seen_from[2] + self.size[2] / 2)
 
     @property
     def known(self) -> tuple[bool, bool]:
@@ -174,8 +182,9 @@ def seen_from(
         for axis in (LENGTH, WIDTH)
         for beyond in (lower[axis] - sensors[:, axis], sensors[:, axis] - upper[axis])
     )
-    mean = (counts[:, None] * sensors[:, :2]).sum(axis=0) / max(total, 1)  # not `@`, which is BLAS
-    return Extent(lower, upper, (rear, front, low, high), total, (float(mean[0]), float(mean[1])))
+    mean = (counts[:, None] * sensors).sum(axis=0) / max(total, 1)  # not `@`, which is BLAS
+    x, y, z = (mean - (lower + upper) / 2).tolist()
+    return Extent(lower, upper, (rear, front, low, high), total, (x, y, z))
 
 
 class Sizes:
@@ -197,6 +206,8 @@ class Sizes:
                 ]
             ).reshape(-1, 3)
             shapes += [(e, surface) for e, surface in own if e.exemplary and len(surface)]
+        below = [e.below_sensor_m for _, e, _ in examples if e.exemplary]
+        self._sensor_m = float(np.median(below)) if below else 0.0  # height above the ground
 
     def complete(self, label: int, extent: Extent) -> tuple[FloatArray, FloatArray]:
         """Return the corners of the whole body: unknown lengths and widths are taken from similar
@@ -207,7 +218,7 @@ class Sizes:
         Returns:
             (3,) lower and (3,) upper corner, metres, actor frame.
         """
-        extent = _without_neighbours(extent)
+        extent = self._standing(_without_neighbours(extent))
         lower, upper = extent.lower.copy(), extent.upper.copy()
         known = extent.known
         if not any(known):  # too few points, or too far away
@@ -230,6 +241,12 @@ class Sizes:
         is_long = _share(upper[LENGTH] - lower[LENGTH], _LORRY_LONG_M)
         upper[2] += is_long * max(lower[2] + _LORRY_TOP_M - upper[2], 0.0)
         return lower, upper
+
+    def _standing(self, extent: Extent) -> Extent:
+        """Return the extent down to the ground: others may hide the lower part of a vehicle."""
+        hidden, distance = self._sensor_m - extent.below_sensor_m, np.hypot(*extent.seen_from[:2])
+        hidden *= _share(hidden, (_SLOPE[0] * distance, _SLOPE[1] * distance))
+        return replace(extent, lower=extent.lower - (0, 0, max(hidden, 0.0)))
 
     def _expected(self, label: int, extent: Extent, axis: int) -> float:
         """Return the length or the width of actors like `extent` in the other size, and in the
@@ -299,7 +316,9 @@ class Sizes:
         # Cells that more than half of the actors share are of the usual shape, not of a load or a
         # neighbour.
         shared = np.concatenate(points)[2 * count[place.reshape(-1)] > len(chosen)]
-        return (shared[shared[:, 2] > _CLEARANCE_M] + lower).astype(np.float32)
+        shared = shared[shared[:, 2] > _CLEARANCE_M] - size / 2
+        shared *= 1 - 2 * _LEARNED_INSET_M / size
+        return (shared + lower + size / 2).astype(np.float32)
 
 
 def surface_of(points: FloatArray) -> Float32Array:

@@ -62,7 +62,7 @@ _FORMATS = {
     "frames": ArrayFormat(("<i8",), (None, 3)),
     "poses": ArrayFormat(("<f8",), (None, 4, 4)),
     "velocities": ArrayFormat(("<f8",), (None, 3)),
-    "bounds": ArrayFormat(("<f8",), (None, 19)),
+    "bounds": ArrayFormat(("<f8",), (None, 20)),
     "table": ArrayFormat(("<i8",), (None, 8)),
     "surfaces": ArrayFormat(("<f4",), (None, 3)),
     "moving": ArrayFormat(("<i4",), (None,)),
@@ -516,7 +516,7 @@ class MovingActors:
             "poses": np.concatenate([np.empty((0, 4, 4)), *poses]),
             "velocities": np.concatenate([np.empty((0, 3)), *velocities]),
             "surfaces": np.concatenate([np.empty((0, 3), np.float32), *surfaces]),
-            "bounds": np.array(bounds, np.float64).reshape(-1, 19),
+            "bounds": np.array(bounds, np.float64).reshape(-1, 20),
             "members": np.concatenate([np.empty(0, np.int32), *members]).astype(np.int32),
             "frames": np.array(frames, np.int64).reshape(-1, 3),
             "moving": np.concatenate([np.empty(0, np.int32), *self.moving.values()]).astype(
@@ -594,11 +594,11 @@ def _tracks(arrays: Mapping[str, AnyArray]) -> dict[int, Track]:
                 bounds[9:12],
                 (rear, front, low, high),
                 points,
-                (float(bounds[16]), float(bounds[17])),
+                tuple(bounds[16:19].tolist()),
             ),
             bool(rigid),
             arrays["surfaces"][point : point + size],
-            float(bounds[18]),
+            float(bounds[19]),
         )
         row, point = row + length, point + size
     return tracks

@@ -142,7 +142,7 @@ class TestBodies:
         members = {frame: np.arange(len(side), dtype=np.int32) for frame in FRAMES}
         poses = np.tile(translation((0.0, 4.0, 0.0)), (len(FRAMES), 1, 1))
         lower, upper = -self.HALF - 0.1, self.HALF + 0.1
-        extent = Extent(-self.HALF, self.HALF, (False, False, True, False), 1000, (0.0, -4.0))
+        extent = Extent(-self.HALF, self.HALF, (False, False, True, False), 1000, (0.0, -4.0, 1.0))
         surface = usual_shell(lower, upper, extent)
         track = Track(
             VEHICLE,

@@ -25,7 +25,7 @@ def track(first=3, frames=10, speed=8.0, label=10, instance=7, rigid=True, confi
     poses[:, 0, 3] = 0.1 * speed * np.arange(frames)
     half = np.array([2.0, 0.9, 0.7])
     members = {first + i: np.arange(i, dtype=np.int32) for i in range(frames)}
-    extent = Extent(-half, half - 0.5, (True, False, True, False), 300, (-9.0, 4.0))
+    extent = Extent(-half, half - 0.5, (True, False, True, False), 300, (-9.0, 4.0, 1.0))
     velocity = np.tile([speed, 0.0, 0.0], (frames, 1))
     surface = np.arange(3 * frames, dtype=np.float32).reshape(-1, 3)
     whole = (-half, half, extent, rigid, surface, confidence)
