@@ -31,6 +31,7 @@ from carlasc.storage.resuming import check_grid
 _AFTER_S = 0.8  # scans up to so much later show what moves in a scan
 # A track is estimated again after so much of the drive: of so many actors with each scan, at most.
 _AGAIN_S, _TOGETHER = 2.0, 2
+_OWN = 20  # the recording vehicle is looked for again after so many frames
 _KEPT = 80  # frames whose observations of actors are kept, at least
 _MOST, _EACH = 120, 6  # scans that may wait; N grows by one with so many of them
 
@@ -89,7 +90,6 @@ class _GrowingDrive:
     def choose(self, sequence: Sequence) -> list[int]:
         """Return the scans to take: every N-th one."""
         self.feed.use(sequence, self._judged)
-        self._follower.find_own()
         frames, known = sequence.frames("points").tolist(), len(sequence.poses)
         new = [frame for frame in frames if self._next <= frame < known][-_MOST:]
         self._every = 1 + len(new) // _EACH
@@ -102,6 +102,8 @@ class _GrowingDrive:
             FormatError: it is not valid.
         """
         self._next = frame + self._every
+        if frame % _OWN < self._every:
+            self._follower.find_own()
         if not self.feed.needs_actors:
             self._judge(frame)
             return
