@@ -85,12 +85,16 @@ class ScanFrame(FrameInput):
     source_frame: int
 
     def __reduce__(self) -> tuple[type[Self], tuple[Any, ...]]:
-        feed = self.inputs.feed
         # Only the actors of the window go to the worker: those of a long drive take megabytes, and
         # each frame is pickled on its own.
-        first, last = feed.options.window
-        near = self.inputs.actors.between(self.number + first, self.number + last)
-        return type(self), (ScanWindow(feed, near), self.number, self.source_frame)
+        near = ScanWindow(self.inputs.feed, self.actors)
+        return type(self), (near, self.number, self.source_frame)
+
+    @property
+    def actors(self) -> MovingActors:
+        """The actors in the window of the frame."""
+        first, last = self.inputs.feed.options.window
+        return self.inputs.actors.between(self.number + first, self.number + last)
 
     def fields(self) -> tuple[str, ...]:
         """Return the names of the scan fields that the frame has."""
@@ -113,7 +117,7 @@ class ScanFrame(FrameInput):
             )
         fields = {name: feed.sequence.read(name, self.number) for name in self.fields()}
         window = feed.reaching(self.number, plan.spec)
-        merged = merge_frame(plan, feed, self.inputs.actors, self.number, window)
+        merged = merge_frame(plan, feed, self.actors, self.number, window)
         return replace(merged, fields=fields)
 
     def thinned(self, plan: GridPlan) -> Grid:
@@ -125,17 +129,15 @@ class ScanFrame(FrameInput):
         others = [frame for frame in window if frame != self.number]
         left_out = set(others[_TENTH // 2 :: _TENTH])
         kept = [frame for frame in window if frame not in left_out]
-        return merge_frame(plan, feed, self.inputs.actors, self.number, kept).grid
+        return merge_frame(plan, feed, self.actors, self.number, kept).grid
 
     def residuals(self) -> Mapping[int, Residual]:
         """Return how well the observations of the moving actors in the frame align with the next
         ones, by number of the actor.
         """
         feed, frame, by_actor = self.inputs.feed, self.number, {}
-        # Later scans in the window only: a worker has no others of a track.
-        last = frame + feed.options.window[1]
-        for number, track in self.inputs.actors.tracks.items():
-            later = min((other for other in track.members if frame < other <= last), default=None)
+        for number, track in self.actors.tracks.items():
+            later = min((other for other in track.members if frame < other), default=None)
             if later is None or frame not in track.members:
                 continue
             here, there = track.pose(frame), track.pose(later)
