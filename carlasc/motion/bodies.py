@@ -22,9 +22,9 @@ _FACE_POINTS, _FACE_SHARE = (
     0.02,
 )
 _FACE_SINE = 0.26  # a scan sees a face if its rays meet the face at 15 degrees or more
-# The slopes of neighbouring channels differ by more. Where the channel above passed lower than the
-# top less this error, a scan shows a part of the actor; of the others, this quantile counts. A top
-# is known if it passed within the last distance.
+# The slopes of neighbouring channels differ by more. Points above the top by more do not count. Of
+# the heights above the top at which the channel above passed, this quantile counts; the top is
+# known if it is nearer than this.
 _CHANNELS, _TOP_M, _LOW, _NARROW_M = 0.003, 0.05, 0.25, 0.2
 _ALIKE = 0.15  # actors are similar if their known sizes differ by this fraction
 # No vehicle is shorter, or narrower, than these shares of the usual size of its kind; from the
@@ -163,28 +163,26 @@ def measure(points: FloatArray, counts: AnyIntArray, sensors: FloatArray) -> Ext
         sensors: (F, 3) position of the sensor in each scan, metres, actor frame.
     """
     lower, upper = np.quantile(points, (_TRIM, 1 - _TRIM), axis=0)
+    scans = zip(np.split(points, np.cumsum(counts)[:-1]), sensors, strict=True)
     passed = [
-        _passed_above(part - sensor) + sensor[2] - upper[2]
-        for seen, sensor in zip(np.split(points, np.cumsum(counts)[:-1]), sensors, strict=True)
+        sensor[2] + _passed_above(part - sensor)
+        for seen, sensor in scans
         if len(part := seen[seen[:, 2] < upper[2] + _TOP_M])
     ]
-    gap_m = float(np.quantile([gap for gap in passed if gap > -_TOP_M] or 0.0, _LOW))
+    gap_m = float(np.quantile([z for z in passed if z > upper[2]] or upper[2], _LOW)) - upper[2]
     extent = seen_from(lower, upper, counts, sensors)
     return replace(extent, gap_m=gap_m) if gap_m > _NARROW_M else extent
 
 
 def _passed_above(seen: FloatArray) -> float:
-    """Return the height at which the channel above those that saw an actor passed it, metres from
-    the sensor; -inf if one channel saw it.
-
-    Args:
-        seen: (M, 3) points of the actor in a scan, metres, from the sensor.
+    """Return the height at which the channel above those of (M, 3) points passed, metres from the
+    sensor; -inf if there is one channel.
     """
     distance = np.maximum(np.hypot(seen[:, 0], seen[:, 1]), 1e-6)
     slopes = seen[:, 2] / distance
-    top = int(np.argmax(slopes))
+    top = slopes.argmax()
     below = slopes[slopes < slopes[top] - _CHANNELS]
-    return float(distance[top] * (2 * slopes[top] - below.max())) if len(below) else -np.inf
+    return float(distance[top] * (2 * slopes[top] - max(below, default=np.inf)))
 
 
 def seen_from(
@@ -300,8 +298,8 @@ class Sizes:
         """Return the height of actors that are as long and as wide as `size`, (3,) metres; without
         such actors, its own height.
 
-        If a ray passed `gap_m` above, the height is between the two, from the ground that is
-        `hidden` metres below; without such actors, a usual height, or halfway.
+        If a ray passed `gap_m` above, it is below that ray, and above what was seen with the
+        `hidden` metres below it; without such actors, a usual height, or halfway.
         """
         sizes = self._known.get(label, np.empty((0, 3)))
         alike = sizes[

@@ -68,8 +68,9 @@ def test_the_channel_above_those_on_an_actor_limits_its_height(sensor_z, gap):
 )
 def test_a_top_between_two_channels_is_that_of_similar_actors(gap, learned, height):
     seen = replace(extent((5.0, 1.9, 1.8), (True, False, True, False)), gap_m=gap)
-    examples = [(CAR, extent((5.0, 1.9, h), EVERY_SIDE), NO_SURFACE) for h in learned]
-    lower, upper = Sizes(examples).complete(CAR, seen)
+    places = [(-20.0, 0.0, 1.9 - h / 2) for h in learned]  # of the sensor, 1.9 m above the ground
+    sizes = [extent((5.0, 1.9, h), EVERY_SIDE, at) for h, at in zip(learned, places, strict=True)]
+    lower, upper = Sizes([(CAR, one, NO_SURFACE) for one in sizes]).complete(CAR, seen)
     assert upper[2] - lower[2] == pytest.approx(height)
     assert lower[2] == -0.9
 
