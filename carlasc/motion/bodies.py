@@ -17,14 +17,11 @@ from carlasc.core.arrays import AnyIntArray, Float32Array, FloatArray, IntArray
 
 _TRIM = 0.01  # share of points that may be outside the body: outliers, points of a neighbour
 # a face is visible if scans with so many points, and this share, see it
-_FACE_POINTS, _FACE_SHARE = (
-    12,
-    0.02,
-)
+_FACE_POINTS, _FACE_SHARE = 12, 0.02
 _FACE_SINE = 0.26  # a scan sees a face if its rays meet the face at 15 degrees or more
-# The slopes of neighbouring channels differ by more. Points above the top by more do not count. Of
-# the heights above the top at which the channel above passed, this quantile counts; the top is
-# known if it is nearer than this.
+# The slopes of neighbouring channels differ by more. Where the channel above passed lower than the
+# top less this error, a scan shows a part of the actor; of the others, this quantile counts. The
+# top is known if that one passed within the last distance.
 _CHANNELS, _TOP_M, _LOW, _NARROW_M = 0.003, 0.05, 0.25, 0.2
 _ALIKE = 0.15  # actors are similar if their known sizes differ by this fraction
 # No vehicle is shorter, or narrower, than these shares of the usual size of its kind; from the
@@ -33,10 +30,7 @@ _SHORTEST = (0.5, 0.7), (0.8, 0.9)
 _HIGHER = 1.6  # the height may grow by less than this factor
 _EXAMPLES = 3  # a size is learned from at least so many actors, and a shape from at most so many
 # cells of surfaces, and cells in which surfaces of several actors are compared
-_CELL_M, _BIN_M = (
-    0.1,
-    0.2,
-)
+_CELL_M, _BIN_M = 0.1, 0.2
 _ACTORS_WIDE_M = 1.3  # narrower vehicles have two wheels
 # Of cars, and of longer or higher vehicles: wider ones have points of a neighbour, or are smeared.
 # They are cut to the usual width, gradually over this width.
@@ -164,12 +158,8 @@ def measure(points: FloatArray, counts: AnyIntArray, sensors: FloatArray) -> Ext
     """
     lower, upper = np.quantile(points, (_TRIM, 1 - _TRIM), axis=0)
     scans = zip(np.split(points, np.cumsum(counts)[:-1]), sensors, strict=True)
-    passed = [
-        sensor[2] + _passed_above(part - sensor)
-        for seen, sensor in scans
-        if len(part := seen[seen[:, 2] < upper[2] + _TOP_M])
-    ]
-    gap_m = float(np.quantile([z for z in passed if z > upper[2]] or upper[2], _LOW)) - upper[2]
+    gaps = [sensor[2] + _passed_above(seen - sensor) - upper[2] for seen, sensor in scans]
+    gap_m = float(np.quantile([gap for gap in gaps if gap > -_TOP_M] or 0.0, _LOW))
     extent = seen_from(lower, upper, counts, sensors)
     return replace(extent, gap_m=gap_m) if gap_m > _NARROW_M else extent
 
@@ -182,7 +172,7 @@ def _passed_above(seen: FloatArray) -> float:
     slopes = seen[:, 2] / distance
     top = slopes.argmax()
     below = slopes[slopes < slopes[top] - _CHANNELS]
-    return float(distance[top] * (2 * slopes[top] - max(below, default=np.inf)))
+    return float(distance[top] * (2 * slopes[top] - (below.max() if len(below) else np.inf)))
 
 
 def seen_from(
