@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,10 +18,9 @@ from carlasc.groundtruth.inputs import (
     FrameInput,
     GridPlan,
     SequenceInput,
+    StoredFrame,
     StoredSequence,
     choose_frames,
-    scan_fields,
-    stored_views,
     without_caches,
 )
 from carlasc.groundtruth.options import FromGrid
@@ -30,9 +29,6 @@ from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath
 from carlasc.storage.inputs import FrameFiles, SequenceFiles, combined
 from carlasc.storage.protocol import Sequence, Source
-
-if TYPE_CHECKING:
-    from carlasc.groundtruth.seen import Views
 
 
 def resample(grid: Grid, spec: GridSpec, classes: ClassTable) -> Grid:
@@ -113,7 +109,7 @@ def check_coarser(fine: GridSpec, coarse: GridSpec) -> None:
 
 
 @dataclass(frozen=True)
-class ResampledFrame(FrameInput):
+class ResampledFrame(StoredFrame):
     """One frame whose finer grid is resampled."""
 
     sequence: Sequence
@@ -121,22 +117,17 @@ class ResampledFrame(FrameInput):
     number: int
     source_frame: int
 
-    def fields(self) -> tuple[str, ...]:
-        """Return the names of the scan fields that the frame has."""
-        return scan_fields(self.sequence, self.number)
-
-    def views(self) -> Views:
-        """Return the cameras of the sequence, and their poses."""
-        return stored_views(self.sequence, self.number)
+    def stored(self) -> Sequence:
+        """Return the sequence."""
+        return self.sequence
 
     def make(self, plan: GridPlan) -> FrameData:
         """Read the frame and resample its grid."""
-        fields = {name: self.sequence.read(name, self.number) for name in self.fields()}
+        fields = self.read()
         finer = self.sequence.grid(self.finer, self.number)
         boxes = _boxes(finer, plan.spec) if plan.voting.keep_seen else None
-        return FrameData(
-            fields, resample(finer, plan.spec, self.sequence.metadata.classes), None, boxes=boxes
-        )
+        grid = resample(finer, plan.spec, self.sequence.metadata.classes)
+        return FrameData(fields, grid, None, boxes=boxes)
 
 
 class ResampledSequence(StoredSequence):

@@ -157,10 +157,8 @@ def _sum(rows: RecordArray) -> RecordArray:
     """Return one row for each voxel, class and actor, with the sum of its points."""
     order = np.lexsort((rows["actor"], rows["label"], rows["voxel"]))
     rows = rows[order]
-    keys = np.stack(
-        [rows["voxel"].astype(np.int64), rows["label"].astype(np.int64) << 32 | rows["actor"]]
-    )
-    first = np.flatnonzero((np.diff(keys, axis=1, prepend=-1) != 0).any(axis=0))
+    keys = rows[["voxel", "label", "actor"]]
+    first = np.flatnonzero(np.append(True, keys[1:] != keys[:-1])[: len(rows)])
     sums = rows[first]
     sums["points"] = np.add.reduceat(rows["points"], first) if len(first) else 0
     return sums

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -32,10 +32,9 @@ from carlasc.groundtruth.inputs import (
     FrameInput,
     GridPlan,
     SequenceInput,
+    StoredFrame,
     StoredSequence,
     choose_frames,
-    scan_fields,
-    stored_views,
 )
 from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.reporting import PoseFacts, Residual
@@ -50,9 +49,6 @@ from carlasc.storage.files import AnyPath
 from carlasc.storage.inputs import combined
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 from carlasc.storage.resuming import RECORD
-
-if TYPE_CHECKING:
-    from carlasc.groundtruth.seen import Views
 
 _MAX_SPEED_M_S, _MAX_TURN_RAD_S = 70.0, 5.0  # no vehicle moves or turns faster
 _RANGE_M = 100.0  # range of a sensor if carlasc.json does not give it
@@ -77,7 +73,7 @@ class ScanWindow:
 
 
 @dataclass(frozen=True)
-class ScanFrame(FrameInput):
+class ScanFrame(StoredFrame):
     """One frame of a sequence, with the scans that vote on it, and the actors in them."""
 
     inputs: ScanSequence | ScanWindow
@@ -92,13 +88,9 @@ class ScanFrame(FrameInput):
         near = self.inputs.actors.between(self.number + first, self.number + last)
         return type(self), (ScanWindow(feed, near), self.number, self.source_frame)
 
-    def fields(self) -> tuple[str, ...]:
-        """Return the names of the scan fields that the frame has."""
-        return scan_fields(self.inputs.feed.sequence, self.number)
-
-    def views(self) -> Views:
-        """Return the cameras of the sequence, and their poses."""
-        return stored_views(self.inputs.feed.sequence, self.number)
+    def stored(self) -> Sequence:
+        """Return the sequence."""
+        return self.inputs.feed.sequence
 
     def make(self, plan: GridPlan) -> FrameData:
         """Read the files of the frame, and count the votes of the scans in its window."""
@@ -111,7 +103,7 @@ class ScanFrame(FrameInput):
                 found="a frame that failed",
                 advice="repair that one, or finish without it with `allow_gaps=True`",
             )
-        fields = {name: feed.sequence.read(name, self.number) for name in self.fields()}
+        fields = self.read()
         window = feed.reaching(self.number, plan.spec)
         merged = merge_frame(plan, feed, self.inputs.actors, self.number, window)
         return replace(merged, fields=fields)

@@ -465,11 +465,8 @@ def interleave(free: AnyArray, rows: AnyArray, votes: AnyArray, most: int) -> No
     for voxel in range(len(free)):
         # `row` is the first row of this voxel or of a later one; free space is label 0, the lowest.
         if free[voxel]:
-            votes[end].voxel, votes[end].label, votes[end].votes = (
-                voxel,
-                0,
-                min(np.int64(free[voxel]), most),
-            )
+            votes[end].voxel, votes[end].label = voxel, 0
+            votes[end].votes = min(np.int64(free[voxel]), most)
             end += 1
         while row < len(rows) and rows[row].voxel == voxel:
             votes[end].voxel, votes[end].label = voxel, rows[row].label

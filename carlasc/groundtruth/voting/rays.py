@@ -127,11 +127,9 @@ def view_from(pose: Pose, cells: Cells) -> GridView:
     nz = float(cells.size[2])
     # The published size of a cell is a float32 difference divided by n, so n cells may not end
     # exactly at the upper bound.
-    ex, ey, ez = (
-        (upper[0] - lower[0]) / voxel[0],
-        (upper[1] - lower[1]) / voxel[1],
-        (upper[2] - lower[2]) / voxel[2],
-    )
+    ex = (upper[0] - lower[0]) / voxel[0]
+    ey = (upper[1] - lower[1]) / voxel[1]
+    ez = (upper[2] - lower[2]) / voxel[2]
     margin = (
         MARGIN
         + max(abs(ex - nx), abs(ey - ny), abs(ez - nz))
