@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +20,6 @@ from carlasc.groundtruth.inputs import (
     SequenceInput,
     StoredFrame,
     StoredSequence,
-    choose_frames,
     without_caches,
 )
 from carlasc.groundtruth.options import FromGrid
@@ -134,16 +133,12 @@ class ResampledSequence(StoredSequence):
     """A sequence whose finer grid is resampled."""
 
     def __init__(self, sequence: Sequence, finer: str, plan: GridPlan) -> None:
-        super().__init__(sequence, plan)
+        super().__init__(sequence, plan, f"{finer}/labels")
         self.finer = finer
+        self._light = without_caches(sequence)
 
-    def _find_frames(self) -> tuple[FrameInput, ...]:
-        available = self.sequence.frames(f"{self.finer}/labels")
-        light = without_caches(self.sequence)
-        return tuple(
-            ResampledFrame(light, self.finer, number, number)
-            for number in choose_frames(self.plan.frames, available, self.location)
-        )
+    def _frame(self, number: int) -> FrameInput:
+        return ResampledFrame(self._light, self.finer, number, number)
 
     def files(self) -> FrameFiles:
         """Return the files of the scans and of the finer grid."""
@@ -155,10 +150,6 @@ class ResampledSequence(StoredSequence):
         texts = (layout.POSES, layout.TIMES) if self.plan.needs_all else ()
         present = self.sequence.documents()
         return [self.sequence.read_document(text) for text in texts if text in present]
-
-    def available(self) -> Collection[int]:
-        """Return the frames with the finer grid."""
-        return frozenset(self.sequence.frames(f"{self.finer}/labels").tolist())
 
     def made_from(self, number: int, own: Mapping[str, str], whole: str) -> str:
         """Return a digest of the scan and the finer grid of a frame."""

@@ -368,14 +368,33 @@ class SequenceInput(ABC):
 
 
 class StoredSequence(SequenceInput):
-    """A sequence of the layout. Its scans, poses, times and frame numbers are kept."""
+    """A sequence of the layout. Its scans, poses, times and frame numbers are kept.
 
-    def __init__(self, sequence: Sequence, plan: GridPlan) -> None:
+    Attributes:
+        sequence: the sequence.
+        plan: the plan of the run.
+        source: the field that grids are made from.
+    """
+
+    def __init__(self, sequence: Sequence, plan: GridPlan, source: str = "points") -> None:
         self.sequence = sequence
         self.plan = plan
+        self.source = source
         self.path = layout.place_of(sequence.path)
         self.location = sequence.location
         self.metadata = sequence.metadata
+
+    def _find_frames(self) -> tuple[FrameInput, ...]:
+        available = self.sequence.frames(self.source)
+        return tuple(map(self._frame, choose_frames(self.plan.frames, available, self.location)))
+
+    @abstractmethod
+    def _frame(self, number: int) -> FrameInput:
+        """Return a frame that has the field which grids are made from."""
+
+    def available(self) -> Collection[int]:
+        """Return the frames with the field that grids are made from."""
+        return frozenset(self.sequence.frames(self.source).tolist())
 
     def files(self) -> FrameFiles | None:
         """Return the files of the scans."""

@@ -4,7 +4,7 @@ of the trajectory.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -34,7 +34,6 @@ from carlasc.groundtruth.inputs import (
     SequenceInput,
     StoredFrame,
     StoredSequence,
-    choose_frames,
 )
 from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.reporting import PoseFacts, Residual
@@ -186,13 +185,12 @@ class ScanSequence(StoredSequence):
         """
         return ScanFeed(self.posed, self.options)
 
-    def _find_frames(self) -> tuple[FrameInput, ...]:
-        chosen = choose_frames(self.plan.frames, self.sequence.frames("points"), self.location)
-        return tuple(ScanFrame(self, number, number) for number in chosen)
+    def _frame(self, number: int) -> FrameInput:
+        return ScanFrame(self, number, number)
 
     def frame(self, number: int) -> FrameInput | None:
         """Return a frame of the sequence, chosen or not; None if it has no scan."""
-        return ScanFrame(self, number, number) if number in self.feed.frames else None
+        return self._frame(number) if number in self.feed.frames else None
 
     def depended(self) -> list[int]:
         """Return all frames if actors or poses are found in them; otherwise those of windows, and
@@ -216,10 +214,6 @@ class ScanSequence(StoredSequence):
     def shared(self) -> object:
         """Return what all frames depend on, besides the settings in params.json."""
         return super().shared(), self.feed.min_range_m, self.feed.max_range_m
-
-    def available(self) -> Collection[int]:
-        """Return the frames with scans."""
-        return frozenset(self.feed.frames.tolist())
 
     def made_from(self, number: int, own: Mapping[str, str], whole: str) -> str:
         """Return a digest of the scans of the window, their poses, and the actors in it."""
@@ -350,11 +344,8 @@ class ScanSequence(StoredSequence):
             notes.append(
                 f"{where}: there are no poses: they were estimated from the scans (kiss-icp)"
             )
-        notes += (
-            []
-            if self.refined is None
-            else [f"{where}: {line}" for line in pose_notes(self.refined, self.feed.frames)]
-        )
+        if self.refined is not None:
+            notes += [f"{where}: {line}" for line in pose_notes(self.refined, self.feed.frames)]
         if self.feed.has_labels and not self.feed.motion and self.options.dynamic != "tube":
             notes.append(f"{where}: no field shows motion: all points were treated as static")
         actors = sum(track.instance >= FIRST_FOUND for track in self.actors.tracks.values())
@@ -364,10 +355,10 @@ class ScanSequence(StoredSequence):
                 is_doubtful(actor["confidence"]) for actor in self.actors.summary if actor["moves"]
             )
             shown = [f"{actors} actors that move ({doubtful} of them doubtful)"] if actors else []
-            shown += (
-                [f"{left_out} {'more ' if actors else ''}points that moved"] if left_out else []
-            )
-            out = ": these points were left out of other frames" if left_out else ""
+            out = ""
+            if left_out:
+                shown.append(f"{left_out} {'more ' if actors else ''}points that moved")
+                out = ": these points were left out of other frames"
             notes.append(
                 f"{where}: free space shows {' and '.join(shown)}, although no field of the data "
                 f"shows it{out}"
@@ -539,13 +530,11 @@ def _check_speed(sequence: Sequence, frames: IntArray, where: str) -> None:
     jumps = np.flatnonzero((speed > _MAX_SPEED_M_S) | (turn > _MAX_TURN_RAD_S))
     if len(jumps):
         row = int(jumps[0])
-        found = (
-            f"a jump of {speed[row]:.0f} m/s and {turn[row]:.1f} rad/s at frame {frames[row + 1]}"
-        )
+        jump = f"a jump of {speed[row]:.0f} m/s and {turn[row]:.1f} rad/s"
         raise FormatError(
             where,
             expected=f"at most {_MAX_SPEED_M_S:g} m/s and {_MAX_TURN_RAD_S:g} rad/s",
-            found=f"{found} ({len(jumps)} in all)",
+            found=f"{jump} at frame {frames[row + 1]} ({len(jumps)} in all)",
             advice="fix the poses (estimated ones jump where scans do not overlap), or continue "
             "with `force=True`",
         )

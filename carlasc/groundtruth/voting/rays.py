@@ -49,6 +49,12 @@ _NEAR_AXIS = 256.0
 
 
 @inlined
+def point_of(points: Float32Array, row: int) -> tuple[Real, Real, Real]:
+    """Return one of (3 n,) points."""
+    return points[3 * row], points[3 * row + 1], points[3 * row + 2]
+
+
+@inlined
 def unit_ray(x: Real, y: Real, z: Real) -> tuple[Real, Real, Real, Real]:
     """Return the norm of a point and the unit ray to it, all float32."""
     # Points are float32, and NumPy computes with them in float32: the published grids were made so.
@@ -67,11 +73,12 @@ def before_sensor(x: Real, ux: Real) -> bool:
 
 @jit
 def sample_voxel(
-    x: Real, y: Real, z: Real, step: float, free_step_m: float, pose: Pose, cells: Cells
+    point: tuple[Real, Real, Real], step: float, free_step_m: float, pose: Pose, cells: Cells
 ) -> tuple[bool, int]:
     """Return whether the sample `step` steps back from a point (0: the point itself) is kept, and
     its voxel.
     """
+    x, y, z = point
     _, ux, uy, uz = unit_ray(x, y, z)
     back = step * free_step_m
     sx = np.float64(x) - ux * back
@@ -115,6 +122,12 @@ class GridView(NamedTuple):
     reach: float
 
 
+@inlined
+def _largest(x: float, y: float, z: float) -> float:
+    """Return the largest absolute value."""
+    return max(abs(x), abs(y), abs(z))
+
+
 @jit
 def view_from(pose: Pose, cells: Cells) -> GridView:
     """Return the view of a grid from a sensor at `pose` (grid_T_sensor)."""
@@ -131,9 +144,7 @@ def view_from(pose: Pose, cells: Cells) -> GridView:
     ey = (upper[1] - lower[1]) / voxel[1]
     ez = (upper[2] - lower[2]) / voxel[2]
     margin = (
-        MARGIN
-        + max(abs(ex - nx), abs(ey - ny), abs(ez - nz))
-        + (AZIMUTH_ERROR / voxel[1] if curved else 0.0)
+        MARGIN + _largest(ex - nx, ey - ny, ez - nz) + (AZIMUTH_ERROR / voxel[1] if curved else 0.0)
     )
     low = (-MARGIN / 2, -MARGIN / 2)
     high = (max(ex, nx) + MARGIN / 2, max(ey, ny) + MARGIN / 2)
@@ -146,10 +157,7 @@ def view_from(pose: Pose, cells: Cells) -> GridView:
     # Rounding may take at most a quarter of the margin. This limits the distance of a point, and
     # its nearness to the axis.
     allowed = MARGIN / 4 * finest / (_NEAR_AXIS if curved else 1.0)
-    known = max(abs(pose[3]), abs(pose[7]), abs(pose[11])) + max(
-        abs(lower[0]), abs(lower[1]), abs(lower[2])
-    )
-    known += max(abs(upper[0]), abs(upper[1]), abs(upper[2]))
+    known = _largest(pose[3], pose[7], pose[11]) + _largest(*lower) + _largest(*upper)
     return GridView(
         curved,
         (
@@ -238,7 +246,7 @@ def clip(
     """
     low, high = view.low, view.high
     for i in range(len(labels)):
-        x, y, z = points[3 * i], points[3 * i + 1], points[3 * i + 2]
+        x, y, z = point_of(points, i)
         norm, ux, uy, uz = unit_ray(x, y, z)
         cx, cy, cz = transform(view.pose, x, y, z)
         ox, oy, oz = view.pose[3], view.pose[7], view.pose[11]
