@@ -440,14 +440,12 @@ class Merger:
                 static[track.members.get(frame, [])] = False
                 if is_doubtful(track.confidence):  # its body may be a part of the static scene
                     continue
-                lower, upper = track.lower - _AROUND_M, track.upper + _AROUND_M
-                least, most = track.lower - _UNDER_M, track.upper + _UNDER_M
                 found = scan.through(track, track.lower - _BESIDE_M, track.upper + _BESIDE_M)
                 if found is None:
                     continue
                 near, body, _ = found
-                inside = ((body >= lower) & (body <= upper)).all(axis=1) & ~ground[near]
-                below = ((body >= least) & (body <= most)).all(axis=1) & ground[near]
+                inside = _is_near(track, body, _AROUND_M) & ~ground[near]
+                below = _is_near(track, body, _UNDER_M) & ground[near]
                 static[near[inside]], under[near[below]] = False, True
                 beside = body[ground[near] & ~below, 2]
                 if len(beside) >= _BESIDE:
@@ -488,6 +486,14 @@ class Merger:
                 seen = np.isin(rays, track.members.get(other, []))
                 kept[number] = cast, np.ascontiguousarray(places[seen].astype(np.float32).T)
         return kept.setdefault(number, None)
+
+
+def _is_near(track: Track, places: FloatArray, margin_m: FloatArray) -> BoolArray:
+    """Return (M,) bool: which of (M, 3) places, metres, frame of the actor, are in its body or
+    within (3,) a margin of it.
+    """
+    inside = (places >= track.lower - margin_m) & (places <= track.upper + margin_m)
+    return np.asarray(inside.all(axis=1))
 
 
 @dataclass(frozen=True)

@@ -416,11 +416,10 @@ class ScanSequence(StoredSequence):
             except CarlascError:
                 continue
             points = scan.points
-            labels = scan.labels
-            classes = sorted(feed.classes.ground)
-            ground = (
-                ground_points(points) if labels is None or not classes else np.isin(labels, classes)
-            )
+            if scan.labels is None or not feed.classes.ground:
+                ground = ground_points(points)
+            else:
+                ground = np.isin(scan.labels, sorted(feed.classes.ground))
             ground &= np.hypot(points[:, 0], points[:, 1]) < abs(spec.upper[0])
             heights.append(points[ground, 2])
         below = np.concatenate(heights) < spec.lower[2]

@@ -329,17 +329,21 @@ def count_hits(
         hit: (N,) the voxels with votes, in the order of their first votes.
         number: how many of them there were before.
     """
-    view, rays = view_from(pose, cells), empty_rays(BLOCK)
-    voxels, begin = np.empty(BLOCK, np.int32), 0
+    view, voxels, begin = view_from(pose, cells), np.empty(BLOCK, np.int32), 0
     doubts, own = len(sure) > 0, np.uint16(voter)
     while begin < points.shape[1]:
         # Places of a block first, in vectorised code: from slices, as Numba would look for negative
         # values of another index, and the processor would gather the numbers one by one.
         end = min(begin + BLOCK, points.shape[1])
         xs, ys, zs = points[0, begin:end], points[1, begin:end], points[2, begin:end]
-        for i in range(len(xs)):
-            rays.x[i], rays.y[i], rays.z[i] = transform(view.pose, xs[i], ys[i], zs[i])
-        place_points(rays, view, voxels[: len(xs)])
+        if view.cylindrical:
+            for i in range(len(xs)):
+                x, y, z = transform(view.pose, xs[i], ys[i], zs[i])
+                voxels[i] = place_cylindrical(x, y, z, view)
+        else:
+            for i in range(len(xs)):
+                x, y, z = transform(view.pose, xs[i], ys[i], zs[i])
+                voxels[i] = place_cartesian(x, y, z, view)
         for i in range(len(xs)):
             voxel = voxels[i]
             if voxel == DOUBTFUL:

@@ -146,13 +146,15 @@ def view_from(pose: Pose, cells: Cells) -> GridView:
     margin = (
         MARGIN + _largest(ex - nx, ey - ny, ez - nz) + (AZIMUTH_ERROR / voxel[1] if curved else 0.0)
     )
-    low = (-MARGIN / 2, -MARGIN / 2)
-    high = (max(ex, nx) + MARGIN / 2, max(ey, ny) + MARGIN / 2)
+    edge = MARGIN / 2
+    low = (-edge, -edge, -edge)
+    high = (max(ex, nx) + edge, max(ey, ny) + edge, max(ez, nz) + edge)
     sx, sy, sz = 1 / voxel[0], 1 / voxel[1], 1 / voxel[2]
     origin, finest = (lower[0], lower[1]), min(voxel[0], voxel[1], voxel[2])
     if curved:
-        low = (-upper[0] - MARGIN, -upper[0] - MARGIN)
-        high = (upper[0] + MARGIN, upper[0] + MARGIN)
+        around = upper[0] + MARGIN
+        low = (-around, -around, -edge)
+        high = (around, around, high[2])
         sx, sy, origin, finest = 1.0, 1.0, (0.0, 0.0), min(voxel[0], voxel[2])
     # Rounding may take at most a quarter of the margin. This limits the distance of a point, and
     # its nearness to the axis.
@@ -165,8 +167,8 @@ def view_from(pose: Pose, cells: Cells) -> GridView:
             *(pose[4] * sy, pose[5] * sy, pose[6] * sy, (pose[7] - origin[1]) * sy),
             *(pose[8] * sz, pose[9] * sz, pose[10] * sz, (pose[11] - lower[2]) * sz),
         ),
-        (low[0], low[1], -MARGIN / 2),
-        (high[0], high[1], max(ez, nz) + MARGIN / 2),
+        low,
+        high,
         (nx, ny, nz),
         (1 / voxel[0], 1 / voxel[1]),
         (lower[0] / voxel[0], lower[1] / voxel[1]),
