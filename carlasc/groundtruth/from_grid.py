@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,10 +18,8 @@ from carlasc.groundtruth.inputs import (
     FrameInput,
     GridPlan,
     SequenceInput,
+    StoredFrame,
     StoredSequence,
-    choose_frames,
-    scan_fields,
-    stored_views,
     without_caches,
 )
 from carlasc.groundtruth.options import FromGrid
@@ -30,9 +28,6 @@ from carlasc.storage import as_source, layout
 from carlasc.storage.files import AnyPath
 from carlasc.storage.inputs import FrameFiles, SequenceFiles, combined
 from carlasc.storage.protocol import Sequence, Source
-
-if TYPE_CHECKING:
-    from carlasc.groundtruth.seen import Views
 
 
 def resample(grid: Grid, spec: GridSpec, classes: ClassTable) -> Grid:
@@ -113,7 +108,7 @@ def check_coarser(fine: GridSpec, coarse: GridSpec) -> None:
 
 
 @dataclass(frozen=True)
-class ResampledFrame(FrameInput):
+class ResampledFrame(StoredFrame):
     """One frame whose finer grid is resampled."""
 
     sequence: Sequence
@@ -121,38 +116,29 @@ class ResampledFrame(FrameInput):
     number: int
     source_frame: int
 
-    def fields(self) -> tuple[str, ...]:
-        """Return the names of the scan fields that the frame has."""
-        return scan_fields(self.sequence, self.number)
-
-    def views(self) -> Views:
-        """Return the cameras of the sequence, and their poses."""
-        return stored_views(self.sequence, self.number)
+    def stored(self) -> Sequence:
+        """Return the sequence."""
+        return self.sequence
 
     def make(self, plan: GridPlan) -> FrameData:
         """Read the frame and resample its grid."""
-        fields = {name: self.sequence.read(name, self.number) for name in self.fields()}
+        fields = self.read()
         finer = self.sequence.grid(self.finer, self.number)
         boxes = _boxes(finer, plan.spec) if plan.voting.keep_seen else None
-        return FrameData(
-            fields, resample(finer, plan.spec, self.sequence.metadata.classes), None, boxes=boxes
-        )
+        grid = resample(finer, plan.spec, self.sequence.metadata.classes)
+        return FrameData(fields, grid, None, boxes=boxes)
 
 
 class ResampledSequence(StoredSequence):
     """A sequence whose finer grid is resampled."""
 
     def __init__(self, sequence: Sequence, finer: str, plan: GridPlan) -> None:
-        super().__init__(sequence, plan)
+        super().__init__(sequence, plan, f"{finer}/labels")
         self.finer = finer
+        self._light = without_caches(sequence)
 
-    def _find_frames(self) -> tuple[FrameInput, ...]:
-        available = self.sequence.frames(f"{self.finer}/labels")
-        light = without_caches(self.sequence)
-        return tuple(
-            ResampledFrame(light, self.finer, number, number)
-            for number in choose_frames(self.plan.frames, available, self.location)
-        )
+    def _frame(self, number: int) -> FrameInput:
+        return ResampledFrame(self._light, self.finer, number, number)
 
     def files(self) -> FrameFiles:
         """Return the files of the scans and of the finer grid."""
@@ -164,10 +150,6 @@ class ResampledSequence(StoredSequence):
         texts = (layout.POSES, layout.TIMES) if self.plan.needs_all else ()
         present = self.sequence.documents()
         return [self.sequence.read_document(text) for text in texts if text in present]
-
-    def available(self) -> Collection[int]:
-        """Return the frames with the finer grid."""
-        return frozenset(self.sequence.frames(f"{self.finer}/labels").tolist())
 
     def made_from(self, number: int, own: Mapping[str, str], whole: str) -> str:
         """Return a digest of the scan and the finer grid of a frame."""

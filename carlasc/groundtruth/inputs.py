@@ -14,13 +14,13 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 from carlasc.core.arrays import AnyArray, FloatArray, IntArray, Uint8Array
 from carlasc.core.choices import CompareInputs
 from carlasc.core.frames import FrameRange
 from carlasc.core.grids import Grid, GridSpec
-from carlasc.errors import ArgumentError, CarlascError, MissingDataError, count
+from carlasc.errors import ArgumentError, CarlascError, MissingDataError, check_types, count
 from carlasc.groundtruth.options import FromGrid, FromScans, Observe, VoteRule, Voting
 from carlasc.groundtruth.reporting import PoseFacts, Residual
 from carlasc.groundtruth.voting.ballot import Votes
@@ -71,10 +71,7 @@ class GridPlan:
     frames: FrameRange
 
     def __post_init__(self) -> None:
-        kinds = get_args(Observe)
-        if not isinstance(self.observe, kinds):
-            names = ", ".join(kind.__name__ for kind in kinds)
-            raise ArgumentError("observe", expected=f"one of {names}", found=repr(self.observe))
+        check_types(GridPlan, vars(self))
         if self.needs_evidence and not (isinstance(self.observe, FromScans) and self.rule == "ray"):
             name = "keep_evidence" if self.voting.keep_evidence else "min_confidence"
             kind = type(self.observe).__name__.removeprefix("From").lower()
@@ -204,6 +201,35 @@ class FrameInput(ABC):
         ones, by number of the actor.
         """
         return {}
+
+
+class StoredFrame(FrameInput):
+    """One frame of a sequence of the layout, which keeps its number."""
+
+    @abstractmethod
+    def stored(self) -> Sequence:
+        """Return the sequence."""
+
+    def fields(self) -> tuple[str, ...]:
+        """Return the names of the scan fields that the frame has."""
+        sequence = self.stored()
+        return tuple(
+            name
+            for name in layout.SCAN_FIELDS
+            if name in sequence.fields() and self.number in sequence.frames(name)
+        )
+
+    def read(self) -> dict[str, AnyArray]:
+        """Read the scan fields of the frame."""
+        return {name: self.stored().read(name, self.number) for name in self.fields()}
+
+    def views(self) -> Views:
+        """Return the cameras of the sequence, each with its pose when it took its image of the
+        frame.
+        """
+        sequence = self.stored()
+        cameras = cameras_of(sequence).values()
+        return [(camera, scan_T_camera(sequence, camera, self.number)) for camera in cameras]
 
 
 class SequenceInput(ABC):
@@ -342,14 +368,33 @@ class SequenceInput(ABC):
 
 
 class StoredSequence(SequenceInput):
-    """A sequence of the layout. Its scans, poses, times and frame numbers are kept."""
+    """A sequence of the layout. Its scans, poses, times and frame numbers are kept.
 
-    def __init__(self, sequence: Sequence, plan: GridPlan) -> None:
+    Attributes:
+        sequence: the sequence.
+        plan: the plan of the run.
+        source: the field that grids are made from.
+    """
+
+    def __init__(self, sequence: Sequence, plan: GridPlan, source: str = "points") -> None:
         self.sequence = sequence
         self.plan = plan
+        self.source = source
         self.path = layout.place_of(sequence.path)
         self.location = sequence.location
         self.metadata = sequence.metadata
+
+    def _find_frames(self) -> tuple[FrameInput, ...]:
+        available = self.sequence.frames(self.source)
+        return tuple(map(self._frame, choose_frames(self.plan.frames, available, self.location)))
+
+    @abstractmethod
+    def _frame(self, number: int) -> FrameInput:
+        """Return a frame that has the field which grids are made from."""
+
+    def available(self) -> Collection[int]:
+        """Return the frames with the field that grids are made from."""
+        return frozenset(self.sequence.frames(self.source).tolist())
 
     def files(self) -> FrameFiles | None:
         """Return the files of the scans."""
@@ -411,6 +456,9 @@ class InputCheck:
     def _name(self) -> str:
         return f"made-{self.grid}"
 
+    def _read(self) -> MadeFrom:
+        return MadeFrom.read(self.writer, self._name)
+
     @cached_property
     def copied(self) -> Collection[str]:
         """The fields of scans that the output may have; none if it is the input."""
@@ -422,7 +470,7 @@ class InputCheck:
         """Whether the grid was made while the input grew, so that all of its frames are made
         again.
         """
-        return MadeFrom.read(self.writer, self._name).whole == PROVISIONAL
+        return self._read().whole == PROVISIONAL
 
     def look(
         self,
@@ -442,7 +490,7 @@ class InputCheck:
         """
         inputs = self.inputs
         files = self.inputs.files()
-        record = self._record = MadeFrom.read(self.writer, self._name)
+        record = self._record = self._read()
         kept = self.compare == "never" and existing and not self.is_provisional
         if files is None or kept:
             return
@@ -487,7 +535,7 @@ class InputCheck:
         """Whether the grid was made from this input, of which some frames changed since: most
         others are as they were.
         """
-        before = MadeFrom.read(self.writer, self._name).own
+        before = self._read().own
         files = self.inputs.files()
         if files is None or self.compare == "never":
             return False
@@ -576,7 +624,7 @@ class InputCheck:
         """
         if not self._whole:
             return
-        record = MadeFrom.read(self.writer, self._name)  # other parts may have written it
+        record = self._read()  # other parts may have written it
         again = self.stale & set(made)
         record.frames |= {str(frame): self._made_from(frame) for frame in sorted(again)}
         record.whole = self._whole
@@ -602,23 +650,6 @@ def choose_frames(frames: FrameRange, available: IntArray, where: str) -> list[i
         expected = "frames" if frames == FrameRange() else f"frames in {frames}"
         raise MissingDataError(where, expected=expected, found=found)
     return chosen
-
-
-def scan_fields(sequence: Sequence, frame: int) -> tuple[str, ...]:
-    """Return the names of the scan fields that a frame has."""
-    present = sequence.fields()
-    return tuple(
-        name for name in layout.SCAN_FIELDS if name in present and frame in sequence.frames(name)
-    )
-
-
-def stored_views(sequence: Sequence, frame: int) -> Views:
-    """Return the cameras of a sequence of the layout, each with its pose when it took its image of
-    a frame.
-    """
-    return [
-        (camera, scan_T_camera(sequence, camera, frame)) for camera in cameras_of(sequence).values()
-    ]
 
 
 def without_caches(sequence: Sequence) -> Sequence:

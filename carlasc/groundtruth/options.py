@@ -87,9 +87,6 @@ class FromScans:
             )
         check_choice("dynamic", self.dynamic, Dynamic)
         check_choice("complete", self.complete, Complete)
-        for name, options in (("motion", MotionOptions), ("poses", PoseOptions)):
-            if not isinstance(value := getattr(self, name), options):
-                raise ArgumentError(name, expected=f"{options.__name__}(...)", found=repr(value))
         if self.dynamic == "tube" and self.motion.source != "auto":
             raise ArgumentError(
                 "motion",

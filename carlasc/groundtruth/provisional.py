@@ -75,7 +75,7 @@ class _GrowingDrive:
         observe = cast(FromScans, plan.observe)
         self.plan = plan
         self.writer = writer
-        (self.first, self.last) = observe.window
+        self.first, self.last = observe.window
         if observe.motion.source != "none":
             observe = replace(observe, motion=replace(observe.motion, source="evidence"))
         self.feed = feed = ScanFeed(sequence, observe)
@@ -151,7 +151,7 @@ class _GrowingDrive:
         """
         plan = self.plan
         writer = self.writer
-        document = layout.params_file(self.plan.grid)
+        document = layout.params_file(plan.grid)
         inputs = ScanSequence(self.feed.sequence, plan, cast(FromScans, plan.observe))
         params = settings_of(inputs, plan)
         check_grid(writer, plan.grid, params, [number], overwrite=True)

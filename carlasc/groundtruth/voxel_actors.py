@@ -94,8 +94,8 @@ class ActorPoints:
         self.deformable = deformable
         self._counts = np.empty(0, _POINTS_DTYPE)
         self._velocity: dict[int, FloatArray] = {}
-        # bounds in x, y of turning actors
-        self._extent: dict[int, tuple[FloatArray, FloatArray]] = {}
+        # (2, 2) lower and upper bounds in x, y of turning actors
+        self._extent: dict[int, FloatArray] = {}
 
     def add(self, recording: SensorRecording, grid_T_sensor: Transform) -> None:
         """Add the points of a recording; numbers of actors are those of the whole recording."""
@@ -118,11 +118,8 @@ class ActorPoints:
             self._velocity.setdefault(actor, own)
             places = points[scan.instances == actor, :2]
             if self.turns.get(actor) and len(places):
-                lower, upper = self._extent.get(actor, (places[0], places[0]))
-                self._extent[actor] = (
-                    np.minimum(lower, places.min(axis=0)),
-                    np.maximum(upper, places.max(axis=0)),
-                )
+                places = np.concatenate([places, self._extent.get(actor, places[:0])])
+                self._extent[actor] = np.stack([places.min(axis=0), places.max(axis=0)])
 
     def of(self, labels: LabelArray) -> VoxelActors:
         """Return the actors of a grid with (X, Y, Z) labels: the most frequent number of the points
@@ -145,11 +142,11 @@ class ActorPoints:
         """Add to the velocity of each voxel the turn of its actor about the middle of the points of
         the actor.
         """
-        for actor, (lower, upper) in self._extent.items():
+        for actor, extent in self._extent.items():
             own = np.flatnonzero(
                 (rows["actor"] == actor) & ~np.isin(rows["label"], list(self.deformable))
             )
-            arm = self.spec.centers_of(rows["voxel"][own])[:, :2] - (lower + upper) / 2
+            arm = self.spec.centers_of(rows["voxel"][own])[:, :2] - extent.mean(axis=0)
             velocity[own, :2] += self.turns[actor] * np.column_stack([-arm[:, 1], arm[:, 0]])
 
 
@@ -157,10 +154,8 @@ def _sum(rows: RecordArray) -> RecordArray:
     """Return one row for each voxel, class and actor, with the sum of its points."""
     order = np.lexsort((rows["actor"], rows["label"], rows["voxel"]))
     rows = rows[order]
-    keys = np.stack(
-        [rows["voxel"].astype(np.int64), rows["label"].astype(np.int64) << 32 | rows["actor"]]
-    )
-    first = np.flatnonzero((np.diff(keys, axis=1, prepend=-1) != 0).any(axis=0))
+    keys = rows[["voxel", "label", "actor"]]
+    first = np.flatnonzero(np.append(True, keys[1:] != keys[:-1])[: len(rows)])
     sums = rows[first]
     sums["points"] = np.add.reduceat(rows["points"], first) if len(first) else 0
     return sums

@@ -348,7 +348,7 @@ def test_arguments_that_are_not_valid_are_refused_before_anything_is_written(
     [
         ({"free_step_m": 0}, "free_step_m: expected a positive number"),
         ({"free_step_m": float("nan")}, "free_step_m: expected a positive number"),
-        ({"rule": "majority"}, "rule: expected sensor, sample or ray, found 'majority'"),
+        ({"rule": "majority"}, "rule: expected one of sensor, sample, ray, found 'majority'"),
     ],
 )
 def test_voting_checks_itself(settings, message):

@@ -5,22 +5,18 @@ by the numbers of the data.
 from __future__ import annotations
 
 from dataclasses import replace
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from carlasc.core.arrays import (
     AnyIntArray,
     BoolArray,
-    Float32Array,
     FloatArray,
-    IntArray,
     Uint32Array,
 )
 from carlasc.core.cells import warped_voxels
 from carlasc.core.geometry import invert, multiply, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
-from carlasc.core.scans import finite
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import STATIC, BodyRegions, Instant
 from carlasc.groundtruth.voxel_actors import VoxelActors, number_actors
@@ -28,9 +24,6 @@ from carlasc.motion.tracks import FIRST_FOUND, MovingActors, Track
 
 _CLASS_PARTS = 1 << 10  # in the upper 16 bits, smaller values may be a class
 _TURN_FRAMES = 3  # frames before and after, between which the turn rate of an actor is measured
-Numbered = tuple[Float32Array, IntArray]
-# the numbered points of scans
-_NUMBERED: WeakKeyDictionary[ScanFeed, dict[int, Numbered]] = WeakKeyDictionary()
 
 
 def with_numbers(actors: MovingActors, feed: ScanFeed) -> MovingActors:
@@ -92,8 +85,9 @@ def find_voxels(
     # Bodies are of moving actors, points and boxes of static ones. Each step fills voxels that the
     # steps before it left without an actor.
     free = movable & (instance == 0)
-    _number_points(spec, feed, actors, now, window, free, instance)
-    _number_boxes(spec, feed, actors, now, free & (instance == 0), instance)
+    moving = {track.instance for track in actors.tracks.values()}
+    _number_points(spec, feed, moving, now, window, free, instance)
+    _number_boxes(spec, feed, moving, now, free & (instance == 0), instance)
     return VoxelActors.of(spec, instance, np.concatenate(voxels), np.concatenate(velocities))
 
 
@@ -121,7 +115,7 @@ def velocity_at(track: Track, frame: int, places: FloatArray, feed: ScanFeed) ->
 def _number_points(
     spec: GridSpec,
     feed: ScanFeed,
-    actors: MovingActors,
+    moving: set[int],
     now: Instant,
     window: list[int],
     free: BoolArray,
@@ -130,16 +124,8 @@ def _number_points(
     """Give voxels without an actor the most frequent number of the static points in them."""
     if "instances" not in feed.sequence.fields() or not window:
         return
-    moving = {track.instance for track in actors.tracks.values()}
-    kept = _NUMBERED.setdefault(feed, {})
-    for old in [frame for frame in kept if frame < now.frame + feed.options.window[0]]:
-        del kept[old]
-    for frame in window:
-        if frame not in kept:
-            kept[frame] = _numbered(feed, frame)
-    points, numbers = (
-        np.concatenate(part) for part in zip(*(kept[frame] for frame in window), strict=True)
-    )
+    of_scans = zip(*map(feed.numbered, window), strict=True)
+    points, numbers = (np.concatenate(parts) for parts in of_scans)
     static = ~np.isin(numbers, list(moving))
     grid_T_world = np.column_stack([now.grid_T_world[:3], np.zeros(3)])[None]
     (voxels,) = warped_voxels(points[static], spec, grid_T_world)
@@ -151,21 +137,10 @@ def _number_points(
     instance[keys[order] >> 32] = (keys[order] & 0xFFFFFFFF).astype(np.uint32)
 
 
-def _numbered(feed: ScanFeed, frame: int) -> Numbered:
-    """Return the (M, 3) numbered points of a scan, metres, world, and their (M,) numbers."""
-    scan = feed.sequence.scan(frame, ("instances",))
-    if scan.instances is None:
-        return np.empty((0, 3), np.float32), np.empty(0, np.int64)
-    own = (scan.instances > 0) & finite(scan.points)
-    return transform_points(feed.pose(frame), scan.points[own]).astype(np.float32), scan.instances[
-        own
-    ].astype(np.int64)
-
-
 def _number_boxes(
     spec: GridSpec,
     feed: ScanFeed,
-    actors: MovingActors,
+    moving: set[int],
     now: Instant,
     free: BoolArray,
     instance: Uint32Array,
@@ -174,12 +149,9 @@ def _number_boxes(
     boxes = feed.sequence.boxes(now.frame) if "boxes" in feed.sequence.fields() else None
     if boxes is None or not len(boxes):
         return
-    moving = {track.instance for track in actors.tracks.values()}
     voxels = np.flatnonzero(free)
-    centers, half = (
-        spec.centers_of(voxels),
-        np.asarray(spec.voxel_size if spec.coordinates == "cartesian" else (0, 0, 0)) / 2,
-    )
+    centers = spec.centers_of(voxels)
+    half = np.asarray(spec.voxel_size if spec.coordinates == "cartesian" else (0, 0, 0)) / 2
     # The largest box first: a smaller box inside of it overwrites its voxels.
     for row in np.argsort(-boxes.sizes.prod(axis=1), kind="stable").tolist():
         if int(boxes.tracks[row]) not in moving:

@@ -6,11 +6,10 @@ Each scan is read and prepared once for all frames that share it.
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator
 from collections.abc import Sequence as Sequence_
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from typing import Any
 from uuid import uuid4
 
@@ -26,7 +25,7 @@ from carlasc.core.arrays import (
 )
 from carlasc.core.geometry import invert, moved_back, transform_points
 from carlasc.core.grids import GridSpec
-from carlasc.core.scans import Scan, check_finite, lengths, sorted_by_origin
+from carlasc.core.scans import Scan, check_finite, finite, lengths, sorted_by_origin
 from carlasc.errors import FormatError, MissingDataError
 from carlasc.groundtruth.from_scans.free_space import FreeSpace
 from carlasc.groundtruth.from_scans.merging import Cast, Instant, Merger, PreparedScan
@@ -127,6 +126,8 @@ class ScanFeed:
         key: the same for all copies of a feed.
         contents: digest of each scan that was compared.
         pose: returns (4, 4) first_T_sensor of a frame.
+        numbered: returns the (M, 3) numbered points of a scan, metres, world, and their (M,)
+            numbers; the most recent ones are cached.
         is_growing: whether more scans come: see `use`.
     """
 
@@ -144,7 +145,12 @@ class ScanFeed:
             if options.max_range_m is not None
             else metadata.max_range_m or np.inf
         )
-        self._scans: OrderedDict[int, PreparedScan] = OrderedDict()
+        # A window of scans and one more: frames are made in order, and the next one needs all of
+        # them but the first.
+        first, last = options.window
+        kept = lru_cache(last - first + 2)
+        self._prepared = kept(self._prepare)
+        self.numbered = kept(self._numbered)
         self._merger = Merger(self.read, MovingActors(), self.classes, options.dynamic)
         self._free: FreeSpace | None = None
         self._lock = threading.RLock()  # an executor may be of threads
@@ -386,29 +392,32 @@ class ScanFeed:
     def read(self, frame: int) -> PreparedScan:
         """Read a scan for merging; the most recent ones are cached."""
         with self._lock:
-            if frame not in self._scans:
-                shows_motion = "flow" in self.motion
-                scan = self._voting_points(frame, _USED if shows_motion else _VOTING)
-                moving = self.classes.have_role(_labels(scan), "moving")
-                if shows_motion and scan.flow is not None:
-                    moving |= is_fast(scan.flow, self.options.motion.min_speed_m_s)
-                self._scans[frame] = PreparedScan.of(
-                    frame,
-                    scan.points,
-                    _labels(scan),
-                    self.pose(frame),
-                    seconds=self.time(frame),
-                    moving=np.flatnonzero(moving),
-                    origins=_places(scan),
-                    probabilities=scan.others.get("probabilities"),
-                )
-                # A window of scans and one more: frames are made in order, and the next one needs
-                # all of them but the first.
-                first, last = self.options.window
-                while len(self._scans) > last - first + 2:
-                    self._scans.popitem(last=False)
-            self._scans.move_to_end(frame)
-            return self._scans[frame]
+            return self._prepared(frame)
+
+    def _prepare(self, frame: int) -> PreparedScan:
+        shows_motion = "flow" in self.motion
+        scan = self._voting_points(frame, _USED if shows_motion else _VOTING)
+        moving = self.classes.have_role(_labels(scan), "moving")
+        if shows_motion and scan.flow is not None:
+            moving |= is_fast(scan.flow, self.options.motion.min_speed_m_s)
+        return PreparedScan.of(
+            frame,
+            scan.points,
+            _labels(scan),
+            self.pose(frame),
+            seconds=self.time(frame),
+            moving=np.flatnonzero(moving),
+            origins=_places(scan),
+            probabilities=scan.others.get("probabilities"),
+        )
+
+    def _numbered(self, frame: int) -> tuple[Float32Array, IntArray]:
+        scan = self.sequence.scan(frame, ("instances",))
+        if scan.instances is None:
+            return np.empty((0, 3), np.float32), np.empty(0, np.int64)
+        own = (scan.instances > 0) & finite(scan.points)
+        world = transform_points(self.pose(frame), scan.points[own]).astype(np.float32)
+        return world, scan.instances[own].astype(np.int64)
 
     def static_points(self, frame: int) -> Float32Array:
         """Return the (N, 3) points of a scan of classes that cannot move, metres, sensor frame; all
@@ -458,11 +467,9 @@ class ScanFeed:
             frame: frame number.
             boxes: the tracks of the sequence's boxes.
         """
-        scan, static, speed = (
-            self._voting_points(frame),
-            StaticPoints.empty(frame),
-            self.options.motion.min_speed_m_s,
-        )
+        scan = self._voting_points(frame)
+        static = StaticPoints.empty(frame)
+        speed = self.options.motion.min_speed_m_s
         if self.motion[:1] == ("flow",):
             static = static_actor_points(
                 frame, scan, self.pose(frame), self.classes.movable, min_speed_m_s=speed
@@ -496,15 +503,15 @@ class ScanFeed:
         """
         scan = self.sequence.scan(frame, fields)
         check_finite(scan.points, f"{self.sequence.location}: points of frame {frame}")
-        if scan.labels is None:
-            scan = replace(scan, labels=np.full(len(scan), self.classes.geometry_id, np.uint32))
+        labels = scan.labels
+        if labels is None:
+            labels = np.full(len(scan), self.classes.geometry_id, np.uint32)
         if self.must_find_ground:
             # points without a class on the ground vote as ground
-            found = ground_points(scan.points) & (_labels(scan) == self.classes.geometry_id)
-            ground = np.where(found, min(self.classes.ground), _labels(scan)).astype(np.uint32)
-            scan = replace(scan, labels=ground)
+            found = ground_points(scan.points) & (labels == self.classes.geometry_id)
+            labels = np.where(found, min(self.classes.ground), labels).astype(np.uint32)
+        scan = replace(scan, labels=labels)
         # Checked before points are left out: a wrong id is an error wherever it is.
-        labels = _labels(scan)
         self.classes.check(labels, f"{self.sequence.location}: labels of frame {frame}")
         origins, times = scan.others.get("origins"), scan.others.get("seconds")
         voting = (labels > 0) & self._in_range(scan)

@@ -81,12 +81,10 @@ def merge_frame(
         frame: frame number.
         window: frames whose scans are merged; the frame itself need not be one of them.
     """
-    merger, now, options, classes = (
-        feed.merger(actors, frame),
-        feed.instant(frame),
-        feed.options,
-        feed.classes,
-    )
+    merger = feed.merger(actors, frame)
+    now = feed.instant(frame)
+    options = feed.options
+    classes = feed.classes
 
     # Free space comes from maps, in which each ray is followed once for all frames. The frame's own
     # rays count everywhere, and those of other scans outside of bodies, or in the body of an actor.
@@ -423,8 +421,8 @@ class _FrameSteps:
         """Return (V,) uint8: the flags of each voxel."""
         flags = seen_now * np.uint8(VoxelFlag.SEEN_NOW)
         flags |= self.in_body * np.uint8(VoxelFlag.IN_ACTOR)
-        for voxels, flag in ((inferred, VoxelFlag.INFERRED), (contested, VoxelFlag.CONTESTED)):
-            flags[voxels] |= np.uint8(flag)
+        flags[inferred] |= np.uint8(VoxelFlag.INFERRED)
+        flags[contested] |= np.uint8(VoxelFlag.CONTESTED)
         return flags
 
     def vote(self, points: Iterable[SeenClass], observations: Iterable[Observation] = ()) -> Ballot:

@@ -311,14 +311,13 @@ class Merger:
         # of each scan, by its frame; then of its points by class, in its own grid or in others, and
         # of what it saw of each actor
         self._static = dict[int, tuple[BoolArray, BoolArray]]()
-        self._labels = dict[int, Uint16Array]()
         self._moving = dict[int, Float32Array]()
         self._points = defaultdict[int, dict[bool, _ByClass]](dict)
         self._carried = defaultdict[int, dict[int, _Carried | None]](dict)
 
     def forget_before(self, frame: int) -> None:
         """Clear the caches of scans before a frame."""
-        for kept in (self._static, self._labels, self._moving, self._points, self._carried):
+        for kept in (self._static, self._moving, self._points, self._carried):
             for other in [key for key in kept if key < frame]:
                 del kept[other]
 
@@ -441,14 +440,12 @@ class Merger:
                 static[track.members.get(frame, [])] = False
                 if is_doubtful(track.confidence):  # its body may be a part of the static scene
                     continue
-                lower, upper = track.lower - _AROUND_M, track.upper + _AROUND_M
-                least, most = track.lower - _UNDER_M, track.upper + _UNDER_M
                 found = scan.through(track, track.lower - _BESIDE_M, track.upper + _BESIDE_M)
                 if found is None:
                     continue
                 near, body, _ = found
-                inside = ((body >= lower) & (body <= upper)).all(axis=1) & ~ground[near]
-                below = ((body >= least) & (body <= most)).all(axis=1) & ground[near]
+                inside = _is_near(track, body, _AROUND_M) & ~ground[near]
+                below = _is_near(track, body, _UNDER_M) & ground[near]
                 static[near[inside]], under[near[below]] = False, True
                 beside = body[ground[near] & ~below, 2]
                 if len(beside) >= _BESIDE:
@@ -469,12 +466,10 @@ class Merger:
 
         All points of an actor have the most frequent class of its points in all scans.
         """
-        if frame not in self._labels:
-            labels = self.scan_of(frame).labels.copy()
-            for track in self.actors.tracks.values() if self.dynamic == "align" else ():
-                labels[track.members.get(frame, [])] = track.label
-            self._labels[frame] = labels
-        return self._labels[frame]
+        labels = self.scan_of(frame).labels.copy()
+        for track in self.actors.tracks.values() if self.dynamic == "align" else ():
+            labels[track.members.get(frame, [])] = track.label
+        return labels
 
     def _carry(self, number: int, other: int, now: Instant) -> _Carried | None:
         """Return what a scan saw of the body of an actor; None if no ray passed through it, or the
@@ -491,6 +486,14 @@ class Merger:
                 seen = np.isin(rays, track.members.get(other, []))
                 kept[number] = cast, np.ascontiguousarray(places[seen].astype(np.float32).T)
         return kept.setdefault(number, None)
+
+
+def _is_near(track: Track, places: FloatArray, margin_m: FloatArray) -> BoolArray:
+    """Return (M,) bool: which of (M, 3) places, metres, frame of the actor, are in its body or
+    within (3,) a margin of it.
+    """
+    inside = (places >= track.lower - margin_m) & (places <= track.upper + margin_m)
+    return np.asarray(inside.all(axis=1))
 
 
 @dataclass(frozen=True)
@@ -561,10 +564,7 @@ class BodyRegions:
         A body has all voxels that it touches. Where bodies overlap, the smaller body has the voxel.
         """
         of_voxel = np.zeros(spec.num_voxels, np.uint16)
-        hidden, hidden_ends = (
-            np.zeros(spec.num_voxels, np.bool_),
-            np.zeros(spec.num_voxels, np.bool_),
-        )
+        hidden, hidden_ends = np.zeros((2, spec.num_voxels), np.bool_)
         columns, heights, across, up = _columns_of(spec)
         largest_first = sorted(bodies, key=lambda body: -float(np.prod(body[1].size)))
         for region, (_, track, pose) in enumerate(largest_first, 1):
@@ -630,14 +630,8 @@ def _on_hidden_face(
         faces: whether scans saw the rear, the front, the side of low y and the side of high y.
     """
     lower, upper = track.lower + BODY_MARGIN_M, track.upper - BODY_MARGIN_M
-    away = np.stack(
-        [
-            cells[:, 0] - lower[0],
-            upper[0] - cells[:, 0],
-            cells[:, 1] - lower[1],
-            upper[1] - cells[:, 1],
-        ]
-    )
-    touches = np.abs(away) <= np.stack([slack[:, 0], slack[:, 0], slack[:, 1], slack[:, 1]])
-    seen = np.array(faces)[:, None]
-    return (touches & ~seen).any(axis=0) & ~(touches & seen).any(axis=0)
+    # of each cell, along x and y, from the lower face and from the upper one
+    away = np.stack([cells - lower, upper - cells], axis=2)[:, :2]
+    touches = np.abs(away) <= slack[:, :2, None]
+    seen = np.reshape(faces, (2, 2))
+    return (touches & ~seen).any(axis=(1, 2)) & ~(touches & seen).any(axis=(1, 2))

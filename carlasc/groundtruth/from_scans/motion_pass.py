@@ -385,7 +385,7 @@ def pose_notes(refined: RefinedPoses, frames: IntArray) -> Iterator[str]:
     left = ", ".join(f"{a} to {b}" for a, b in refined.left(frames)[:3])
     if refined.refined.any() and (before != after or not len(refined.loops)):
         but = f"; those of frames {left} were left alone" if left else ""
-        yield (f"poses were refined: neighbouring scans disagreed by {before}, now by {after}{but}")
+        yield f"poses were refined: neighbouring scans disagreed by {before}, now by {after}{but}"
     if len(refined.loops):
         was, now = 100 * np.sqrt(np.square(refined.loops[:, 2:]).mean(axis=0))
         yield (
@@ -399,4 +399,4 @@ def pose_notes(refined: RefinedPoses, frames: IntArray) -> Iterator[str]:
             f"{frames[rows[-1]]}, which were not refined: check that these belong to them"
         )
     elif not refined.refined.any() and (refined.disagreements_m[0] or 0.0) > _NOTED_M:
-        yield (f"poses could not be refined, although neighbouring scans disagree by {before}")
+        yield f"poses could not be refined, although neighbouring scans disagree by {before}"

@@ -4,11 +4,11 @@ of the trajectory.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -32,10 +32,8 @@ from carlasc.groundtruth.inputs import (
     FrameInput,
     GridPlan,
     SequenceInput,
+    StoredFrame,
     StoredSequence,
-    choose_frames,
-    scan_fields,
-    stored_views,
 )
 from carlasc.groundtruth.options import FromScans
 from carlasc.groundtruth.reporting import PoseFacts, Residual
@@ -50,9 +48,6 @@ from carlasc.storage.files import AnyPath
 from carlasc.storage.inputs import combined
 from carlasc.storage.protocol import Sequence, SequenceWriter, Source
 from carlasc.storage.resuming import RECORD
-
-if TYPE_CHECKING:
-    from carlasc.groundtruth.seen import Views
 
 _MAX_SPEED_M_S, _MAX_TURN_RAD_S = 70.0, 5.0  # no vehicle moves or turns faster
 _RANGE_M = 100.0  # range of a sensor if carlasc.json does not give it
@@ -77,7 +72,7 @@ class ScanWindow:
 
 
 @dataclass(frozen=True)
-class ScanFrame(FrameInput):
+class ScanFrame(StoredFrame):
     """One frame of a sequence, with the scans that vote on it, and the actors in them."""
 
     inputs: ScanSequence | ScanWindow
@@ -96,13 +91,9 @@ class ScanFrame(FrameInput):
         first, last = self.inputs.feed.options.window
         return self.inputs.actors.between(self.number + first, self.number + last)
 
-    def fields(self) -> tuple[str, ...]:
-        """Return the names of the scan fields that the frame has."""
-        return scan_fields(self.inputs.feed.sequence, self.number)
-
-    def views(self) -> Views:
-        """Return the cameras of the sequence, and their poses."""
-        return stored_views(self.inputs.feed.sequence, self.number)
+    def stored(self) -> Sequence:
+        """Return the sequence."""
+        return self.inputs.feed.sequence
 
     def make(self, plan: GridPlan) -> FrameData:
         """Read the files of the frame, and count the votes of the scans in its window."""
@@ -115,7 +106,7 @@ class ScanFrame(FrameInput):
                 found="a frame that failed",
                 advice="repair that one, or finish without it with `allow_gaps=True`",
             )
-        fields = {name: feed.sequence.read(name, self.number) for name in self.fields()}
+        fields = self.read()
         window = feed.reaching(self.number, plan.spec)
         merged = merge_frame(plan, feed, self.actors, self.number, window)
         return replace(merged, fields=fields)
@@ -196,13 +187,12 @@ class ScanSequence(StoredSequence):
         """
         return ScanFeed(self.posed, self.options)
 
-    def _find_frames(self) -> tuple[FrameInput, ...]:
-        chosen = choose_frames(self.plan.frames, self.sequence.frames("points"), self.location)
-        return tuple(ScanFrame(self, number, number) for number in chosen)
+    def _frame(self, number: int) -> FrameInput:
+        return ScanFrame(self, number, number)
 
     def frame(self, number: int) -> FrameInput | None:
         """Return a frame of the sequence, chosen or not; None if it has no scan."""
-        return ScanFrame(self, number, number) if number in self.feed.frames else None
+        return self._frame(number) if number in self.feed.frames else None
 
     def depended(self) -> list[int]:
         """Return all frames if actors or poses are found in them; otherwise those of windows, and
@@ -226,10 +216,6 @@ class ScanSequence(StoredSequence):
     def shared(self) -> object:
         """Return what all frames depend on, besides the settings in params.json."""
         return super().shared(), self.feed.min_range_m, self.feed.max_range_m
-
-    def available(self) -> Collection[int]:
-        """Return the frames with scans."""
-        return frozenset(self.feed.frames.tolist())
 
     def made_from(self, number: int, own: Mapping[str, str], whole: str) -> str:
         """Return a digest of the scans of the window, their poses, and the actors in it."""
@@ -360,11 +346,8 @@ class ScanSequence(StoredSequence):
             notes.append(
                 f"{where}: there are no poses: they were estimated from the scans (kiss-icp)"
             )
-        notes += (
-            []
-            if self.refined is None
-            else [f"{where}: {line}" for line in pose_notes(self.refined, self.feed.frames)]
-        )
+        if self.refined is not None:
+            notes += [f"{where}: {line}" for line in pose_notes(self.refined, self.feed.frames)]
         if self.feed.has_labels and not self.feed.motion and self.options.dynamic != "tube":
             notes.append(f"{where}: no field shows motion: all points were treated as static")
         actors = sum(track.instance >= FIRST_FOUND for track in self.actors.tracks.values())
@@ -374,10 +357,10 @@ class ScanSequence(StoredSequence):
                 is_doubtful(actor["confidence"]) for actor in self.actors.summary if actor["moves"]
             )
             shown = [f"{actors} actors that move ({doubtful} of them doubtful)"] if actors else []
-            shown += (
-                [f"{left_out} {'more ' if actors else ''}points that moved"] if left_out else []
-            )
-            out = ": these points were left out of other frames" if left_out else ""
+            out = ""
+            if left_out:
+                shown.append(f"{left_out} {'more ' if actors else ''}points that moved")
+                out = ": these points were left out of other frames"
             notes.append(
                 f"{where}: free space shows {' and '.join(shown)}, although no field of the data "
                 f"shows it{out}"
@@ -435,11 +418,10 @@ class ScanSequence(StoredSequence):
             except CarlascError:
                 continue
             points = scan.points
-            labels = scan.labels
-            classes = sorted(feed.classes.ground)
-            ground = (
-                ground_points(points) if labels is None or not classes else np.isin(labels, classes)
-            )
+            if scan.labels is None or not feed.classes.ground:
+                ground = ground_points(points)
+            else:
+                ground = np.isin(scan.labels, sorted(feed.classes.ground))
             ground &= np.hypot(points[:, 0], points[:, 1]) < abs(spec.upper[0])
             heights.append(points[ground, 2])
         below = np.concatenate(heights) < spec.lower[2]
@@ -549,13 +531,11 @@ def _check_speed(sequence: Sequence, frames: IntArray, where: str) -> None:
     jumps = np.flatnonzero((speed > _MAX_SPEED_M_S) | (turn > _MAX_TURN_RAD_S))
     if len(jumps):
         row = int(jumps[0])
-        found = (
-            f"a jump of {speed[row]:.0f} m/s and {turn[row]:.1f} rad/s at frame {frames[row + 1]}"
-        )
+        jump = f"a jump of {speed[row]:.0f} m/s and {turn[row]:.1f} rad/s"
         raise FormatError(
             where,
             expected=f"at most {_MAX_SPEED_M_S:g} m/s and {_MAX_TURN_RAD_S:g} rad/s",
-            found=f"{found} ({len(jumps)} in all)",
+            found=f"{jump} at frame {frames[row + 1]} ({len(jumps)} in all)",
             advice="fix the poses (estimated ones jump where scans do not overlap), or continue "
             "with `force=True`",
         )

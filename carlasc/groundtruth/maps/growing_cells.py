@@ -120,7 +120,7 @@ def split(parts: IntArray, rows: AnyArray) -> list[tuple[Part, AnyArray]]:
     begins = np.flatnonzero(
         (np.diff(parts, axis=0, prepend=np.iinfo(np.int64).min) != 0).any(axis=1)
     )
-    places: list[Part] = [(int(p[0]), int(p[1]), int(p[2])) for p in parts[begins]]
+    places: list[Part] = [(group, x, y) for group, x, y in parts[begins].tolist()]
     pieces = np.split(rows, begins)[1:]  # without the empty piece before the first part
     return [(place, _added([piece])) for place, piece in zip(places, pieces, strict=True)]
 

@@ -374,14 +374,14 @@ def write_grid(source: Source, name: str, frames: FrameRange, files: MapFiles) -
     size = grid.spec.voxel_size.astype(np.float64)
     index = np.argwhere(grid.known)
     labels = grid.labels[grid.known]
-    occupied = grid.known & (grid.labels > 0)
+    occupied = labels > 0
     if not occupied.any():
         raise MissingDataError(where, expected="occupied voxels", found="none")
     points = np.zeros(int(occupied.sum()), POINT_DTYPE)
-    for axis, middles in zip("xyz", (lower + (np.argwhere(occupied) + 0.5) * size).T, strict=True):
+    for axis, middles in zip("xyz", (lower + (index[occupied] + 0.5) * size).T, strict=True):
         points[axis] = middles
-    points["label"] = grid.labels[occupied]
-    points["seen"] = 1 if grid.counts is None else grid.counts[occupied]
+    points["label"] = labels[occupied]
+    points["seen"] = 1 if grid.counts is None else grid.counts[grid.known][occupied]
     points["confidence"] = points["seen"] / (points["seen"] + 1.0)
     pieces = PointPieces(
         len(points), lambda: iter([points]), sequence.metadata.classes, f"voxels of {where}"

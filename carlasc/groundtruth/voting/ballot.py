@@ -9,10 +9,9 @@ and a voxel without votes is unknown: see the format page, `docs/format.md#votes
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +19,6 @@ from carlasc.core.arrays import (
     AnyArray,
     BoolArray,
     Float32Array,
-    Int32Array,
     IntArray,
     LabelArray,
     Uint8Array,
@@ -32,7 +30,7 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, check_rigid
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA
-from carlasc.errors import ArgumentError, FormatError
+from carlasc.errors import ArgumentError, FormatError, check_choice
 from carlasc.groundtruth.voting import filled, kernel
 from carlasc.storage.field_files import VOTES_DTYPE, votes_dtype
 
@@ -173,8 +171,7 @@ def check_rule(rule: str, free_step_m: float) -> None:
     Raises:
         ArgumentError: an unknown rule, or a distance that is not positive.
     """
-    if rule not in get_args(VoteRule):
-        raise ArgumentError("rule", expected="sensor, sample or ray", found=repr(rule))
+    check_choice("rule", rule, VoteRule)
     if not (math.isfinite(free_step_m) and free_step_m > 0):
         raise ArgumentError(
             "free_step_m", expected="a positive number of metres", found=free_step_m
@@ -209,14 +206,11 @@ class Ballot:
         free_step_m: float = 1.5,
         keep_boxes: bool = False,
     ) -> None:
-
         check_rule(rule, free_step_m)
-        self.spec, self.classes, self.rule, self.free_step_m = (
-            spec,
-            classes,
-            rule,
-            float(free_step_m),
-        )
+        self.spec = spec
+        self.classes = classes
+        self.rule = rule
+        self.free_step_m = float(free_step_m)
         self.num_observations = 0
         once = rule == "sensor"
         # The arrays of free space have one element more than there are voxels: samples outside of
@@ -227,7 +221,7 @@ class Ballot:
             once,
             free=np.zeros(spec.num_voxels + 1, np.uint32),
             passed=np.zeros(spec.num_voxels + 1 if once else 0, np.uint8),
-            heads=_no_heads(spec.num_voxels),
+            heads=np.full(spec.num_voxels, kernel.NONE, np.int32),
             candidates=np.empty(0, kernel.CANDIDATE_DTYPE),
             used=np.zeros(1, np.int64),
         )
@@ -311,10 +305,6 @@ class Ballot:
         candidates = self._tally.candidates[: self._tally.used[0]]
         occupied = np.empty(len(candidates), OCCUPIED_DTYPE)
         kernel.collect(self._tally.heads, candidates, occupied)
-        if not copy:
-            _KEPT.heads = self._tally.heads
-            _KEPT.heads[candidates["voxel"]] = kernel.NONE
-            self._tally = self._tally._replace(heads=_Kept.heads)
         free = self.free.reshape(self.spec.size)
         boxes = self._boxes.copy() if copy and self._boxes is not None else self._boxes
         return Votes(self.spec, self.classes, free.copy() if copy else free, occupied, boxes)
@@ -329,22 +319,6 @@ class Ballot:
             grown = np.empty(2 * (used + points), candidates.dtype)
             grown[:used] = candidates[:used]
             self._tally = self._tally._replace(candidates=grown)
-
-
-class _Kept(threading.local):
-    """The heads of a ballot of this thread that is complete, for the next one: when a new array is
-    first written, the system clears each of its pages.
-    """
-
-    heads = np.empty(0, np.int32)
-
-
-_KEPT = _Kept()
-
-
-def _no_heads(count: int) -> Int32Array:
-    heads, _KEPT.heads = _KEPT.heads, _Kept.heads
-    return heads if len(heads) == count else np.full(count, kernel.NONE, np.int32)
 
 
 def _ready(values: AnyArray, dtype: type[np.generic]) -> AnyArray:

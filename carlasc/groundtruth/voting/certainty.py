@@ -142,33 +142,24 @@ def probability(
     curves = _HIT[:, 0] + finer * (_HIT[:, 1] - _HIT[:, 0])
     for begin in range(0, len(hits), _BLOCK):
         part = slice(begin, begin + _BLOCK)
-        posterior[part] = _logistic(
-            hits[part], free_m[part], matter[part], in_body[part], curves, step_m
+        path_m = free_m[part]
+        samples = np.log(np.maximum(path_m / step_m, 1.0))
+        score = np.where(
+            in_body[part],
+            _FREE_IN_BODY[0] + _FREE_IN_BODY[1] * samples,
+            _FREE[0] + _FREE[1] * samples,
         )
+        # One half is added to hits and to the hits at the threshold: few hits are weak evidence,
+        # and the ratio is finite without a free path.
+        hit = hits[part] > 0
+        kinds = matter[part][hit]
+        offset, slope = curves[kinds].T
+        ratio = np.log((hits[part][hit] + 0.5) / (_PER_M[kinds] * path_m[hit] + 0.5))
+        # More hits must never lower a probability, also where the slope is extrapolated to other
+        # sizes.
+        score[hit] = offset + np.maximum(slope, 0.2) * ratio
+        posterior[part] = np.where(hit | (path_m > 0), 1 / (1 + np.exp(-score)), UNKNOWN)
     return posterior
-
-
-def _logistic(
-    hits: AnyIntArray,
-    free_m: AnyFloatArray,
-    matter: NDArray[np.int8],
-    in_body: BoolArray,
-    curves: FloatArray,
-    step_m: float,
-) -> AnyFloatArray:
-    samples = np.log(np.maximum(free_m / step_m, 1.0))
-    score = np.where(
-        in_body, _FREE_IN_BODY[0] + _FREE_IN_BODY[1] * samples, _FREE[0] + _FREE[1] * samples
-    )
-    # One half is added to hits and to the hits at the threshold: few hits are weak evidence, and
-    # the ratio is finite without a free path.
-    hit = hits > 0
-    offset, slope = curves[matter[hit]].T
-    ratio = np.log((hits[hit] + 0.5) / (_PER_M[matter[hit]] * free_m[hit] + 0.5))
-    # More hits must never lower a probability, also where the slope is extrapolated to other sizes.
-    score[hit] = offset + np.maximum(slope, 0.2) * ratio
-    posterior = 1 / (1 + np.exp(-score))
-    return np.where(hit | (free_m > 0), posterior, UNKNOWN)
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,6 +39,7 @@ from carlasc.groundtruth.voting.rays import (
     place_cartesian,
     place_cylindrical,
     place_points,
+    point_of,
     sample_voxel,
     unit_ray,
     view_from,
@@ -154,9 +155,7 @@ def vote_occupied(
             continue
         voxel = voxels[i]
         if voxel == DOUBTFUL or states[i] == UNSURE:
-            _, voxel = sample_voxel(
-                points[3 * i], points[3 * i + 1], points[3 * i + 2], 0.0, 0.0, pose, cells
-            )
+            _, voxel = sample_voxel(point_of(points, i), 0.0, 0.0, pose, cells)
         if voxel >= len(heads):
             continue
         if voxel == last and labels[i] == label:
@@ -193,8 +192,7 @@ def vote_free(
     voxels = np.empty(CHUNK, np.int32)
     for i in range(len(labels)):
         if rays.state[i] == UNSURE:
-            point = points[3 * i], points[3 * i + 1], points[3 * i + 2]
-            vote_free_by_rule(point, pose, view, cells, free_step_m, tally)
+            vote_free_by_rule(point_of(points, i), pose, view, cells, free_step_m, tally)
         if rays.state[i] != SURE:
             continue
         x = rays.x[i]
@@ -225,10 +223,8 @@ def vote_free(
             if lowest == DOUBTFUL:
                 for j in range(number):
                     if voxels[j] == DOUBTFUL:
-                        point = points[3 * i], points[3 * i + 1], points[3 * i + 2]
-                        voxels[j] = sample_voxel(
-                            point[0], point[1], point[2], step + j, free_step_m, pose, cells
-                        )[1]
+                        point = point_of(points, i)
+                        _, voxels[j] = sample_voxel(point, step + j, free_step_m, pose, cells)
             if tally.once:
                 for j in range(number):
                     tally.passed[np.uint32(voxels[j])] = 1
@@ -267,7 +263,7 @@ def vote_free_by_rule(
     step = np.floor(step)
     kept = step < 2.0**52  # above it, step + 1 may be equal to step
     while kept and step <= last + 1.0:
-        kept, voxel = sample_voxel(x, y, z, step, free_step_m, pose, cells)
+        kept, voxel = sample_voxel(point, step, free_step_m, pose, cells)
         if tally.once:
             tally.passed[voxel] = 1
         else:
@@ -465,11 +461,8 @@ def interleave(free: AnyArray, rows: AnyArray, votes: AnyArray, most: int) -> No
     for voxel in range(len(free)):
         # `row` is the first row of this voxel or of a later one; free space is label 0, the lowest.
         if free[voxel]:
-            votes[end].voxel, votes[end].label, votes[end].votes = (
-                voxel,
-                0,
-                min(np.int64(free[voxel]), most),
-            )
+            votes[end].voxel, votes[end].label = voxel, 0
+            votes[end].votes = min(np.int64(free[voxel]), most)
             end += 1
         while row < len(rows) and rows[row].voxel == voxel:
             votes[end].voxel, votes[end].label = voxel, rows[row].label

@@ -49,6 +49,12 @@ _NEAR_AXIS = 256.0
 
 
 @inlined
+def point_of(points: Float32Array, row: int) -> tuple[Real, Real, Real]:
+    """Return one of (3 n,) points."""
+    return points[3 * row], points[3 * row + 1], points[3 * row + 2]
+
+
+@inlined
 def unit_ray(x: Real, y: Real, z: Real) -> tuple[Real, Real, Real, Real]:
     """Return the norm of a point and the unit ray to it, all float32."""
     # Points are float32, and NumPy computes with them in float32: the published grids were made so.
@@ -67,11 +73,12 @@ def before_sensor(x: Real, ux: Real) -> bool:
 
 @jit
 def sample_voxel(
-    x: Real, y: Real, z: Real, step: float, free_step_m: float, pose: Pose, cells: Cells
+    point: tuple[Real, Real, Real], step: float, free_step_m: float, pose: Pose, cells: Cells
 ) -> tuple[bool, int]:
     """Return whether the sample `step` steps back from a point (0: the point itself) is kept, and
     its voxel.
     """
+    x, y, z = point
     _, ux, uy, uz = unit_ray(x, y, z)
     back = step * free_step_m
     sx = np.float64(x) - ux * back
@@ -115,6 +122,12 @@ class GridView(NamedTuple):
     reach: float
 
 
+@inlined
+def _largest(x: float, y: float, z: float) -> float:
+    """Return the largest absolute value."""
+    return max(abs(x), abs(y), abs(z))
+
+
 @jit
 def view_from(pose: Pose, cells: Cells) -> GridView:
     """Return the view of a grid from a sensor at `pose` (grid_T_sensor)."""
@@ -127,31 +140,26 @@ def view_from(pose: Pose, cells: Cells) -> GridView:
     nz = float(cells.size[2])
     # The published size of a cell is a float32 difference divided by n, so n cells may not end
     # exactly at the upper bound.
-    ex, ey, ez = (
-        (upper[0] - lower[0]) / voxel[0],
-        (upper[1] - lower[1]) / voxel[1],
-        (upper[2] - lower[2]) / voxel[2],
-    )
+    ex = (upper[0] - lower[0]) / voxel[0]
+    ey = (upper[1] - lower[1]) / voxel[1]
+    ez = (upper[2] - lower[2]) / voxel[2]
     margin = (
-        MARGIN
-        + max(abs(ex - nx), abs(ey - ny), abs(ez - nz))
-        + (AZIMUTH_ERROR / voxel[1] if curved else 0.0)
+        MARGIN + _largest(ex - nx, ey - ny, ez - nz) + (AZIMUTH_ERROR / voxel[1] if curved else 0.0)
     )
-    low = (-MARGIN / 2, -MARGIN / 2)
-    high = (max(ex, nx) + MARGIN / 2, max(ey, ny) + MARGIN / 2)
+    edge = MARGIN / 2
+    low = (-edge, -edge, -edge)
+    high = (max(ex, nx) + edge, max(ey, ny) + edge, max(ez, nz) + edge)
     sx, sy, sz = 1 / voxel[0], 1 / voxel[1], 1 / voxel[2]
     origin, finest = (lower[0], lower[1]), min(voxel[0], voxel[1], voxel[2])
     if curved:
-        low = (-upper[0] - MARGIN, -upper[0] - MARGIN)
-        high = (upper[0] + MARGIN, upper[0] + MARGIN)
+        around = upper[0] + MARGIN
+        low = (-around, -around, -edge)
+        high = (around, around, high[2])
         sx, sy, origin, finest = 1.0, 1.0, (0.0, 0.0), min(voxel[0], voxel[2])
     # Rounding may take at most a quarter of the margin. This limits the distance of a point, and
     # its nearness to the axis.
     allowed = MARGIN / 4 * finest / (_NEAR_AXIS if curved else 1.0)
-    known = max(abs(pose[3]), abs(pose[7]), abs(pose[11])) + max(
-        abs(lower[0]), abs(lower[1]), abs(lower[2])
-    )
-    known += max(abs(upper[0]), abs(upper[1]), abs(upper[2]))
+    known = _largest(pose[3], pose[7], pose[11]) + _largest(*lower) + _largest(*upper)
     return GridView(
         curved,
         (
@@ -159,8 +167,8 @@ def view_from(pose: Pose, cells: Cells) -> GridView:
             *(pose[4] * sy, pose[5] * sy, pose[6] * sy, (pose[7] - origin[1]) * sy),
             *(pose[8] * sz, pose[9] * sz, pose[10] * sz, (pose[11] - lower[2]) * sz),
         ),
-        (low[0], low[1], -MARGIN / 2),
-        (high[0], high[1], max(ez, nz) + MARGIN / 2),
+        low,
+        high,
         (nx, ny, nz),
         (1 / voxel[0], 1 / voxel[1]),
         (lower[0] / voxel[0], lower[1] / voxel[1]),
@@ -240,7 +248,7 @@ def clip(
     """
     low, high = view.low, view.high
     for i in range(len(labels)):
-        x, y, z = points[3 * i], points[3 * i + 1], points[3 * i + 2]
+        x, y, z = point_of(points, i)
         norm, ux, uy, uz = unit_ray(x, y, z)
         cx, cy, cz = transform(view.pose, x, y, z)
         ox, oy, oz = view.pose[3], view.pose[7], view.pose[11]
