@@ -181,7 +181,7 @@ def make_track(
         positions, velocities, headings = estimated
         chain = [segment.at_frame(v) for segment, v in zip(chain, velocities, strict=True)]
         observations = [segment.points for segment in chain]
-        if path is None and is_static(observations, positions, headings, seconds):
+        if path is None and is_static(observations, estimated, seconds):
             positions, velocities, headings = (
                 np.zeros_like(values) for values in (positions, velocities, headings)
             )
