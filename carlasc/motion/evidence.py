@@ -35,7 +35,16 @@ from carlasc.core.arrays import (
     LabelArray,
     Uint32Array,
 )
-from carlasc.core.cells import Pose, as_pose, distinct, fast_azimuth, joined, numbered, transform
+from carlasc.core.cells import (
+    Pose,
+    as_pose,
+    cells_of,
+    distinct,
+    fast_azimuth,
+    joined,
+    numbered,
+    transform,
+)
 from carlasc.core.compiling import cached, inlined
 from carlasc.core.geometry import Transform, invert, multiply, spread_rows, thin, transform_points
 from carlasc.core.scans import finite, runs_of_origins
@@ -251,7 +260,7 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     world = transform_points(scan.world_T_sensor, scan.points[candidates].astype(np.float64))
     # One point per small cell is looked up: the others of the cell are of the same surface, and
     # looking up costs most of the time.
-    asked_first, same = numbered(np.floor(world / _JUDGED_CELL_M).astype(np.int64))
+    asked_first, same = numbered(cells_of(world, _JUDGED_CELL_M))
     verdict = _judge(
         scan, candidates[asked_first], [window[i] for i in before], [window[i] for i in after]
     )
@@ -287,7 +296,7 @@ def cells_around(points: AnyFloatArray) -> IntArray:
     near = points[(np.abs(points) < OWN_REACH_M).all(axis=1)]
     if not len(near):
         return np.empty(0, np.int64)
-    cells = np.floor(near / OWN_CELL_M).astype(np.int64) + OWN_CELLS // 2
+    cells = cells_of(near, OWN_CELL_M) + OWN_CELLS // 2
     flags = np.zeros(OWN_CELLS**3, np.bool_)  # faster than `np.unique`
     flags[np.ravel_multi_index(tuple(cells.T), (OWN_CELLS,) * 3, mode="clip")] = True
     return np.flatnonzero(flags)
@@ -391,7 +400,7 @@ def _clusters(
     flagged = np.flatnonzero(either)
     if len(flagged) < _MIN_POINTS:
         return []
-    cell = np.floor(world[:, :2] / _CELL_M).astype(np.int64)
+    cell = cells_of(world[:, :2], _CELL_M)
     low, high = cell[flagged].min(axis=0) - 1, cell[flagged].max(axis=0) + 1
     x, y = ((axis >= a) & (axis <= b) for axis, a, b in zip(cell.T, low, high, strict=True))
     inside = np.flatnonzero(x & y)
@@ -429,7 +438,7 @@ def _count_around(world: FloatArray, groups: list[IntArray], static: BoolArray) 
     cells or beside them, at its height.
     """
     # Row and column in one number, so that neighbours are at fixed steps: 2^20 cells are 367 km.
-    cell = np.floor(world[:, :2] / _CELL_M).astype(np.int64) + (1 << 20)
+    cell = cells_of(world[:, :2], _CELL_M) + (1 << 20)
     key, rows = (cell[:, 0] << 21) | cell[:, 1], np.flatnonzero(static)
     rows = rows[np.argsort(key[rows], kind="stable")]
     keys = key[rows]

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from carlasc.core.arrays import BoolArray, FloatArray, IntArray
-from carlasc.core.geometry import Transform, invert, multiply, rotations_of, slerp, small_motions
-from carlasc.motion.solving import solve_positive
+from carlasc.core.geometry import Transform, invert, multiply, poses_from, slerp, small_motions
+from carlasc.motion.solving import solve_positive, squares_of
 
 _LAGS = (2, 5, 10, 20)  # scans between the start and the end of a compared motion
 _ROUNDS = 8
@@ -126,9 +126,7 @@ def find_mounting(
         )
         scaled, slope = off / scale, slope / scale[:, None]
         weights = 1.0 / (1.0 + np.square(scaled) / _ROBUST)
-        information = (weights[:, :, None, None] * slope[:, :, :, None] * slope[:, :, None, :]).sum(
-            axis=(0, 1)
-        )
+        information = squares_of(slope.reshape(-1, 7), weights.reshape(-1))
         # values that are not determined stay zero
         information += np.diag((10.0 * _DETERMINED) ** -2.0)
         right = -(weights[:, :, None] * slope * scaled[:, :, None]).sum(axis=(0, 1))
@@ -219,10 +217,8 @@ def _residuals(parts: Sequence[_Motions], values: FloatArray) -> FloatArray:
 
 def _transform(values: FloatArray) -> Transform:
     """Return the (4, 4) pose of the sensor from the first six values."""
-    mounted = np.eye(4)
     x, y, z = values[3:6]
     angle = float(np.sqrt(x * x + y * y + z * z))
     half = np.sin(angle / 2) / angle if angle > 1e-9 else 0.5
-    mounted[:3, :3] = rotations_of(np.array([[np.cos(angle / 2), half * x, half * y, half * z]]))[0]
-    mounted[:3, 3] = values[:3]
-    return mounted
+    turn = np.array([[np.cos(angle / 2), half * x, half * y, half * z]])
+    return np.asarray(poses_from(turn, values[None, :3])[0])

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from carlasc.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray, IntArray
-from carlasc.core.cells import distinct, first_of_cells
+from carlasc.core.cells import cells_of, distinct, first_of_cells
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import (
     Transform,
@@ -238,7 +238,7 @@ class _PlaneOdometry:
 
 def _thinned(points: Float32Array, voxel_m: float) -> Float32Array:
     """Return one of the (N, 3) points in each voxel."""
-    return points[first_of_cells(np.floor(points / np.float32(voxel_m)).astype(np.int64))]
+    return points[first_of_cells(cells_of(points, voxel_m))]
 
 
 def measure_drift(points: Callable[[int], AnyFloatArray], poses: FloatArray) -> tuple[float, bool]:
@@ -331,7 +331,7 @@ def _follow(
 
 def _cells_above(points: AnyFloatArray) -> IntArray:
     """Return the distinct cells (row, column), seen from above, of things above the sensor."""
-    cells = np.floor(points[points[:, 2] > _ABOVE_M, :2] / _CELL_M).astype(np.int64) + _CELLS // 2
+    cells = cells_of(points[points[:, 2] > _ABOVE_M, :2], _CELL_M) + _CELLS // 2
     inside = ((cells >= 0) & (cells < _CELLS)).all(axis=1)
     return np.unique(cells[inside], axis=0)
 

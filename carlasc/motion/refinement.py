@@ -22,7 +22,7 @@ from typing import Self
 import numpy as np
 
 from carlasc.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from carlasc.core.cells import first_of_cells
+from carlasc.core.cells import cells_of, first_of_cells
 from carlasc.core.choices import LoopMode
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import invert, multiply, small_motions, transform_points
@@ -94,8 +94,8 @@ class ThinnedScan:
     def of(cls, points: Float32Array, world_T_sensor: FloatArray) -> Self:
         """Choose from the (N, 3) points of a scan, metres, sensor frame, which should be static."""
         near = points[(np.abs(points) < _FAR_M).all(axis=1)]
-        chosen = near[first_of_cells(np.floor(near / np.float32(_THIN_M)).astype(np.int64))]
-        x, y, z = np.floor(transform_points(world_T_sensor, chosen) / _PLACE_M).astype(np.int64).T
+        chosen = near[first_of_cells(cells_of(near, _THIN_M))]
+        x, y, z = cells_of(transform_points(world_T_sensor, chosen), _PLACE_M).T
         measured = ((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) % _PLACES == 0
         return cls(chosen[~measured], chosen[measured])
 
