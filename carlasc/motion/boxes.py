@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from carlasc.core.arrays import FloatArray, IntArray, LabelArray
+from carlasc.core.arrays import BoolArray, FloatArray, IntArray, LabelArray
 from carlasc.core.boxes import Boxes, mirror_boxes
 from carlasc.core.geometry import (
     Transform,
@@ -212,22 +212,15 @@ def segment_by_boxes(
 
 
 def _inside(
-    track: Track,
-    pose: Transform,
-    points: FloatArray,
-    labels: LabelArray | None,
-) -> IntArray:
-    """Return the indices of the (M, 3) points, world, that are in a track's box at a pose and above
-    its ground.
-    """
-    reach = np.linalg.norm(np.maximum(np.abs(track.lower), np.abs(track.upper)), axis=0)
-    near = np.flatnonzero(np.abs(points[:, 1] - pose[1, 3]) <= reach)
-    body = transform_points(invert(pose), points[near])
+    track: Track, pose: Transform, points: FloatArray, labels: LabelArray | None
+) -> BoolArray:
+    """Return which of (M, 3) points, world, are in a track's box at a pose and above its ground."""
+    body = transform_points(invert(pose), points)
     inside = ((body >= track.lower) & (body <= track.upper)).all(axis=1)
     above = body[:, 2] > track.lower[2] + BODY_MARGIN_M + _FLOOR_M
     if labels is not None:
-        above |= labels[near] == track.label
-    return near[inside & above]
+        above |= labels == track.label
+    return inside & above
 
 
 def _boxes_of(places: list[tuple[int, Boxes, int]], times: Mapping[int, float]) -> _ObjectBoxes:

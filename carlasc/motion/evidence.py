@@ -657,8 +657,9 @@ def look_up(
 
 
 @inlined
-def _count(bits: np.int64) -> np.int64:
+def _count(flags: np.uint32 | np.int64) -> np.int64:
     """Return how many of the lower 32 bits are set."""
+    bits = np.int64(flags)
     # Neighbouring bits are added in pairs, then in fours, then in bytes (Warren, "Hacker's
     # Delight", 5-1); the product adds the four bytes in the highest one.
     bits -= (bits >> 1) & 0x55555555
@@ -687,10 +688,10 @@ def undecided(
             such a place is decided.
     """
     kept = np.empty_like(asked)
-    count, rest = 0, _count(np.int64(left[0])) + _count(np.int64(left[1]))
+    count, rest = 0, _count(left[0]) + _count(left[1])
     for i in asked:
-        passed = _count(np.int64(free[0, i])) + _count(np.int64(free[1, i]))
-        occupied = _count(np.int64(hit[0, i])) + _count(np.int64(hit[1, i]))
+        passed = _count(free[0, i]) + _count(free[1, i])
+        occupied = _count(hit[0, i]) + _count(hit[1, i])
         # The rest of the scans can add at most `rest` to either count. A point is decided when no
         # such addition changes which count is greater, or the length of a row without a hit.
         moves = passed >= least[0] and passed > occupied + rest

@@ -389,8 +389,11 @@ def _register(one: SubmapPlanes, other: SubmapPlanes, start: Transform) -> Trans
     return np.asarray(poses[0])
 
 
-def _inside(centres: FloatArray, origin: FloatArray) -> BoolArray:
-    return np.hypot(centres[:, 0] - origin[0], centres[:, 1] - origin[1]) < _INSIDE_M
+def _inside(centres: FloatArray, motion: Transform) -> BoolArray:
+    """Return which of (P, 3) centres, frame of the first submap, are near both origins."""
+    x, y, _ = centres.T
+    away = np.maximum(np.hypot(x, y), np.hypot(x - motion[0, 3], y - motion[1, 3]))
+    return away < _INSIDE_M
 
 
 def _common(one: SubmapPlanes, other: SubmapPlanes, motion: Transform, pairs: Pairs) -> float:
@@ -401,8 +404,8 @@ def _common(one: SubmapPlanes, other: SubmapPlanes, motion: Transform, pairs: Pa
     centres, _ = other.moved(motion)
     shares = []
     for planes, rows, near in (
-        (one, a, _inside(one.centres, motion[:3, 3]) & _inside(one.centres, np.zeros(3))),
-        (other, b, _inside(centres, np.zeros(3)) & _inside(centres, motion[:3, 3])),
+        (one, a, _inside(one.centres, motion)),
+        (other, b, _inside(centres, motion)),
     ):
         common = np.zeros(len(near), np.bool_)
         common[rows] = True

@@ -36,6 +36,8 @@ class Planes:
         points: (M, 3) metres, actor frame.
         normals: (M, 3) normals of the planes. Their length, at most 1, grows with the flatness of
             the points. The normal of a single point or of a line has length 0.
+        in_order: (M, 3) points, sorted along the axis of their largest extent, the (M,) index of
+            each in `points`, and this axis; known after `add`.
     """
 
     def __init__(self) -> None:
@@ -61,16 +63,9 @@ class Planes:
         changed = extend_sums(joined, known, _PLANE_M, sums)
         normals[changed] = _normals(covariances(sums[changed]))
         self.points, self.normals, self._sums = joined, normals, sums
-        self._widest = int(np.ptp(joined, axis=0).argmax())
-        self._order = np.argsort(joined[:, self._widest], kind="stable")
-        self._sorted = joined[self._order]
-
-    @property
-    def in_order(self) -> tuple[FloatArray, IntArray, int]:
-        """(M, 3) points, sorted along the axis of their largest extent, the (M,) index of each in
-        `points`, and this axis.
-        """
-        return self._sorted, self._order, self._widest
+        widest = int(np.ptp(joined, axis=0).argmax())
+        order = np.argsort(joined[:, widest], kind="stable")
+        self.in_order = joined[order], order, widest
 
 
 def covariances(sums: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice, pairwise
 from typing import Self
@@ -200,12 +200,9 @@ def refine_poses(
         keep: called with the poses of the first scans, after each stretch but the last one.
     """
     count, poses = len(given), given.copy()
-    before, after, refined = (
-        np.full(count, np.nan),
-        np.full(count, np.nan),
-        np.zeros(count, np.bool_),
-    )
-    fits = np.ones(count, np.bool_)
+    before, after = np.full((2, count), np.nan)
+    refined, fits = np.zeros(count, np.bool_), np.ones(count, np.bool_)
+    made = RefinedPoses(given, poses, before, after, refined, fits)
     done = 0 if begun is None else len(begun.poses)
     if begun is not None:
         poses[:done] = begun.poses
@@ -256,9 +253,8 @@ def refine_poses(
         submaps.finish()
         closed, found = close_loops(submaps.done, poses)
         if len(found) and (always or _is_better(found[:, 2], found[:, 3])):
-            refined[:] = True
-            return RefinedPoses(given, closed, before, after, refined, fits, found)
-    return RefinedPoses(given, poses, before, after, refined, fits)
+            return replace(made, poses=closed, refined=np.ones_like(refined), loops=found)
+    return made
 
 
 def _may_return(given: FloatArray) -> bool:
@@ -276,14 +272,11 @@ def _may_return(given: FloatArray) -> bool:
 
 
 def _is_better(before: FloatArray, after: FloatArray) -> bool:
-    both = np.isfinite(before) & np.isfinite(after)
+    gain = before - after
+    both = np.isfinite(gain)
     if not both.any():
         return False
-    was, now, gain = (
-        float(before[both].mean()),
-        float(after[both].mean()),
-        before[both] - after[both],
-    )
+    was, now, gain = float(before[both].mean()), float(after[both].mean()), gain[both]
     error = float(gain.std()) * float(np.sqrt(_ALIKE / len(gain)))
     sure = now < min(_SURE * was, was - _SURELY_M) and was - now > _ERRORS * error
     return sure or now < min(_BETTER * was, was - _NEARER_M)

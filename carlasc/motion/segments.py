@@ -222,8 +222,8 @@ def _join(points: FloatArray, velocity: FloatArray) -> IntArray:
     ).astype(np.int64)
     _, cell = numbered(keys)
     count = np.bincount(cell)
-    center = np.stack([np.bincount(cell, points[:, a]) for a in range(3)], axis=1) / count[:, None]
-    speed = np.stack([np.bincount(cell, velocity[:, a]) for a in range(3)], axis=1) / count[:, None]
+    sums = np.array([np.bincount(cell, values) for values in (*points.T, *velocity.T)])
+    center, speed = np.split((sums / count).T, 2, axis=1)
     offset = center[:, None] - center[None]
     ahead = speed / np.maximum(np.linalg.norm(speed, axis=1), 1e-9)[:, None]
     along2 = np.square(np.einsum("ijk,ik->ij", offset, ahead))

@@ -475,47 +475,29 @@ class MovingActors:
 
     def to_bytes(self, key: str, *, is_compressed: bool = True) -> bytes:
         """Return the content of a file with these actors. `key` is a digest of their source."""
-        table = []
-        poses = []
-        velocities = []
-        bounds = []
-        members = []
-        frames = []
-        surfaces = []
+        table, bounds, frames, members = [], [], [], list[AnyIntArray]()
+        tracks = self.tracks.values()
         for number, track in self.tracks.items():
-            table.append(
-                (
-                    number,
-                    track.label,
-                    track.instance,
-                    track.first,
-                    len(track.world_T_actor),
-                    track.extent.points,
-                    track.rigid,
-                    len(track.surface),
-                )
-            )
-            poses.append(track.world_T_actor)
-            velocities.append(track.velocity)
-            surfaces.append(track.surface)
-            extent = track.extent
+            extent, sizes = track.extent, (len(track.world_T_actor), track.extent.points)
+            about = number, track.label, track.instance, track.first
+            table.append((*about, *sizes, track.rigid, len(track.surface)))
             corners = [track.lower, track.upper, extent.lower, extent.upper]
             bounds.append(
                 np.concatenate([*corners, extent.faces, extent.seen_from, [track.confidence]])
             )
-            for frame, own in track.members.items():
-                members.append(own)
-                frames.append((number, frame, len(own)))
+            members += track.members.values()
+            frames += [(number, frame, len(own)) for frame, own in track.members.items()]
         # Tables of numbers, one row per track or per scan of a track, and the values of all tracks
         # one after the other: a file of ten arrays is read at once, whatever the number of tracks.
-        facts = {"key": key, "summary": self.summary, "seen": self.seen}
-        about = json.dumps(facts).encode()
+        facts = json.dumps({"key": key, "summary": self.summary, "seen": self.seen})
         arrays = {
-            "about": np.frombuffer(about, np.uint8),
+            "about": np.frombuffer(facts.encode(), np.uint8),
             "table": np.array(table, np.int64).reshape(-1, 8),
-            "poses": np.concatenate([np.empty((0, 4, 4)), *poses]),
-            "velocities": np.concatenate([np.empty((0, 3)), *velocities]),
-            "surfaces": np.concatenate([np.empty((0, 3), np.float32), *surfaces]),
+            "poses": np.concatenate([np.empty((0, 4, 4)), *(t.world_T_actor for t in tracks)]),
+            "velocities": np.concatenate([np.empty((0, 3)), *(t.velocity for t in tracks)]),
+            "surfaces": np.concatenate(
+                [np.empty((0, 3), np.float32), *(t.surface for t in tracks)]
+            ),
             "bounds": np.array(bounds, np.float64).reshape(-1, 20),
             "members": np.concatenate([np.empty(0, np.int32), *members]).astype(np.int32),
             "frames": np.array(frames, np.int64).reshape(-1, 3),
