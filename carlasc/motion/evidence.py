@@ -46,10 +46,11 @@ from carlasc.core.cells import (
     transform,
 )
 from carlasc.core.compiling import cached, inlined
-from carlasc.core.geometry import Transform, invert, multiply, spread_rows, thin, transform_points
+from carlasc.core.geometry import Transform, invert, multiply, transform_points
 from carlasc.core.scans import finite, runs_of_origins
 from carlasc.errors import FormatError
 from carlasc.motion.ground import ground_points
+from carlasc.motion.paths import Segment
 
 HORIZON_S = 5.0  # fact: horizon
 """Scans up to this many seconds before and after a scan are looked up."""
@@ -114,6 +115,24 @@ class EvidenceScan:
                 raise FormatError(name, expected=f"shape ({len(self.points)},)", found=values.shape)
 
 
+class MovedCluster(NamedTuple):
+    """Points of a scan that moved together.
+
+    Attributes:
+        segment: the points, without velocity; its class is 0 without labels.
+        freed: number of points at places that were free at other times.
+        passed: number of them at places that were free most of the time, not on one side in time
+            only, as behind edges.
+        around: number of static points around it, at its height. It is large for pieces of static
+            objects.
+    """
+
+    segment: Segment
+    freed: int
+    passed: int
+    around: int
+
+
 @dataclass(frozen=True)
 class FreeSpaceEvidence:
     """The clusters of points that moved in one scan.
@@ -122,44 +141,26 @@ class FreeSpaceEvidence:
         frame: frame number.
         seconds: time of the scan.
         count: number of points of the scan.
-        clusters: (M,) int64 indices of the points of each cluster.
-        points: (M, 3) float64 of the same points, metres, world.
-        labels: most frequent class of each cluster; 0 without labels.
-        freed: number of points of each cluster at places that were free at other times.
-        passed: number of them at places that were free most of the time, not on one side in time
-            only, as behind edges.
-        around: number of static points around each cluster, at its height. It is large for pieces
-            of static objects.
+        clusters: the clusters.
         world_T_sensor: (4, 4) pose of the scan.
         near: (K,) cells of the points around the sensor that are not ground: see `cells_around`.
-        times: seconds of the `points` after the time of the scan; empty if they are unknown.
         ground_m: height of the ground around the sensor, metres, sensor frame; NaN without any.
     """
 
     frame: int
     seconds: float
     count: int
-    clusters: tuple[IntArray, ...]
-    points: tuple[FloatArray, ...]
-    labels: tuple[int, ...]
-    freed: tuple[int, ...]
-    passed: tuple[int, ...]
-    around: tuple[int, ...]
+    clusters: tuple[MovedCluster, ...]
     world_T_sensor: Transform
     near: IntArray
-    times: tuple[AnyFloatArray, ...] = ()
     ground_m: float = math.nan
 
     def thinned(self, most: int = 2000) -> FreeSpaceEvidence:
-        """Return the same with at most `most` of the `points` of each cluster; `clusters` stay
+        """Return the same with at most `most` of the points of each cluster; members stay
         complete.
         """
-        if not self.times:
-            return replace(self, points=tuple(thin(points, most) for points in self.points))
-        rows = [spread_rows(len(points), most) for points in self.points]
-        points = tuple(own[kept] for own, kept in zip(self.points, rows, strict=True))
-        times = tuple(own[kept] for own, kept in zip(self.times, rows, strict=True))
-        return replace(self, points=points, times=times)
+        thin = (one._replace(segment=one.segment.thinned(most)) for one in self.clusters)
+        return replace(self, clusters=tuple(thin))
 
 
 @dataclass(frozen=True)
@@ -270,22 +271,21 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
         labels = scan.labels[candidates].astype(np.int64)
         kind = np.where(np.isin(labels, sorted(movable)), labels, 0)
     groups = _clusters(world, kind, moved, left, static, stays)
-    freed, passed = (
-        tuple(int(flags[group].sum()) for group in groups) for flags in (moved | left, moved)
-    )
-    clusters = [candidates[group] for group in groups]
-    points = [world[group] for group in groups]
-    classes = [
-        0 if scan.labels is None else int(np.bincount(scan.labels[own]).argmax())
-        for own in clusters
-    ]
-    around = _count_around(world, groups, static)
-    parts = (tuple(clusters), tuple(points), tuple(classes), freed, passed, around)
+    clusters = []
+    for group, around in zip(groups, _count_around(world, groups, static), strict=True):
+        members = candidates[group]
+        label = 0 if scan.labels is None else int(np.bincount(scan.labels[members]).argmax())
+        times = None if scan.times is None else scan.times[members]
+        origin = scan.world_T_sensor[:3, 3]
+        segment = Segment(
+            scan.frame, label, members, world[group], None, origin=origin, times=times
+        )
+        freed, passed = (int(flags[group].sum()) for flags in (moved | left, moved))
+        clusters.append(MovedCluster(segment, freed, passed, around))
     near = cells_around(scan.points[candidates])
-    times = () if scan.times is None else tuple(scan.times[members] for members in clusters)
     below = scan.points[ground & (np.abs(scan.points[:, :2]) < _AROUND_M).all(axis=1), 2]
     height = float(np.median(below)) if len(below) else math.nan
-    about = *parts, scan.world_T_sensor, near, times, height
+    about = tuple(clusters), scan.world_T_sensor, near, height
     return FreeSpaceEvidence(scan.frame, own.seconds, len(scan.points), *about)
 
 

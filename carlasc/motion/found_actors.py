@@ -25,6 +25,7 @@ from carlasc.motion.evidence import (
     OWN_CELLS,
     OWN_REACH_M,
     FreeSpaceEvidence,
+    MovedCluster,
     cells_around,
 )
 from carlasc.motion.paths import (
@@ -165,9 +166,9 @@ class ActorFollower:
         before it.
         """
         passed = (
-            members
-            for members, count, freed in zip(scan.clusters, scan.passed, scan.freed, strict=True)
-            if count >= _PASSED * freed
+            cluster.segment.members
+            for cluster in scan.clusters
+            if cluster.passed >= _PASSED * cluster.freed
         )
         moved = np.sort(np.concatenate([np.empty(0, np.int64), *passed]))
         self.moved[scan.frame] = moved.astype(np.int32)
@@ -177,12 +178,12 @@ class ActorFollower:
             self._grounds.append(scan.ground_m)
         self._near[scan.near] += 1
         sensor_T_world = invert(scan.world_T_sensor)
-        for members, points in zip(scan.clusters, scan.points, strict=True):
-            local = transform_points(sensor_T_world, points)
+        for segment, *_ in scan.clusters:
+            local = transform_points(sensor_T_world, segment.points)
             cells = cells_around(local)
             self._freed[cells] += 1
             if len(cells) and np.abs(local).max() < OWN_REACH_M:
-                self._close.append((scan.frame, members.astype(np.int32), cells))
+                self._close.append((scan.frame, segment.members.astype(np.int32), cells))
         before, self._alive = self._alive, []
         ended = list[_ActorChain]()
         for one in before:
@@ -290,19 +291,11 @@ class _Link:
     world_T_sensor: Transform
 
     @classmethod
-    def of(cls, evidence: FreeSpaceEvidence, index: int) -> _Link:
-        points = evidence.points[index]
+    def of(cls, evidence: FreeSpaceEvidence, cluster: MovedCluster) -> _Link:
+        segment, freed, _, around = cluster
+        lower, upper = segment.points.min(axis=0), segment.points.max(axis=0)
         pose = evidence.world_T_sensor
-        freed = evidence.freed[index]
-        around = evidence.around[index]
-        members, label = evidence.clusters[index], evidence.labels[index]
-        times = evidence.times[index] if evidence.times else None
-        segment = Segment(
-            evidence.frame, label, members, points, None, origin=pose[:3, 3], times=times
-        )
-        return cls(
-            evidence.seconds, segment, points.min(axis=0), points.max(axis=0), freed, around, pose
-        )
+        return cls(evidence.seconds, segment, lower, upper, freed, around, pose)
 
     @property
     def middle(self) -> FloatArray:
@@ -652,7 +645,7 @@ def _link(
     """Continue chains with the clusters of a scan, best pairs first; join further parts to them;
     start new chains with the rest.
     """
-    clusters = [_Link.of(evidence, index) for index in range(len(evidence.clusters))]
+    clusters = [_Link.of(evidence, cluster) for cluster in evidence.clusters]
     apart = [part.thinned(_KEPT) for part in _split(clusters, alive)]
     links = _join_parts(apart, deformable)
     taken = best_pairs(_costs(links, alive) if alive and links else [])
