@@ -639,11 +639,8 @@ def look_up(
     for i in asked:
         x, y, z = transform(pose, float(points[i, 0]), float(points[i, 1]), float(points[i, 2]))
         # from there, the point is in a column near this one, with nearly the same origin
-        if moved and x * x + y * y > 0:
-            place = origin[_column(fast_azimuth(x, y))]
-            x, y, z = x - place[0], y - place[1], z - place[2]
-        else:
-            x, y, z = x - origin[0, 0], y - origin[0, 1], z - origin[0, 2]
+        c = _column(fast_azimuth(x, y)) if moved and x * x + y * y > 0 else 0
+        x, y, z = x - origin[c, 0], y - origin[c, 1], z - origin[c, 2]
         flat = math.sqrt(x * x + y * y)
         # Above, below and inside the vehicle, a direction says nothing about the place.
         if flat < _MIN_RANGE_M:

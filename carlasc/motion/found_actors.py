@@ -318,10 +318,6 @@ class _Link:
             around=round(self.around * share),
         )
 
-    def thinned(self, most: int) -> _Link:
-        """Return the same with at most `most` points, within the same bounds."""
-        return replace(self, segment=self.segment.thinned(most))
-
     @property
     def is_small(self) -> bool:
         """Whether it is not larger than a person."""
@@ -505,10 +501,8 @@ class _ActorChain:
         `ground_m` is the height of the ground, metres, sensor frame; NaN if it is unknown.
         """
         local = self._local()
-        lower, upper = (
-            np.median([bound(points, axis=0) for points in local], axis=0)
-            for bound in (np.min, np.max)
-        )
+        bounds = [(points.min(axis=0), points.max(axis=0)) for points in local]
+        lower, upper = np.median(bounds, axis=0)
         length, width, high = upper - lower
         if (
             lower[2] - ground_m < _FOOT_M
@@ -646,7 +640,8 @@ def _link(
     start new chains with the rest.
     """
     clusters = [_Link.of(evidence, cluster) for cluster in evidence.clusters]
-    apart = [part.thinned(_KEPT) for part in _split(clusters, alive)]
+    # bounds stay those of all points
+    apart = [replace(p, segment=p.segment.thinned(_KEPT)) for p in _split(clusters, alive)]
     links = _join_parts(apart, deformable)
     taken = best_pairs(_costs(links, alive) if alive and links else [])
     main = sorted(taken, key=taken.__getitem__)

@@ -25,6 +25,7 @@ import numpy as np
 from carlasc.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from carlasc.core.cells import run_starts
 from carlasc.core.compiling import cached, jit
+from carlasc.core.geometry import thin
 from carlasc.motion.planes import SQUARES, SUMS
 from carlasc.motion.solving import principal_axes, solve_positive, squares_of
 
@@ -157,18 +158,14 @@ def _choose(normals: FloatArray, thickness: FloatArray) -> IntArray:
     over the scene.
     """
     rows = np.flatnonzero(thickness >= 0)
-    x = normals[rows, 0]
-    y = normals[rows, 1]
-    upright = np.abs(normals[rows, 2])
+    x, y, z = normals[rows].T
+    upright = np.abs(z)
     # Four quarters of the compass for walls, by which axis is greater and by the sign of x y: a
     # normal and its opposite are in the same quarter. Without limits, ground would outvote walls.
     wall = 2 + 2 * (np.abs(x) > np.abs(y)) + (x * y > 0)
     direction = np.where(upright > _STEEP, 0, np.where(upright > _SLANTED, 1, wall))
-    chosen = [rows[:0]]
-    for number in range(6):
-        own = rows[direction == number]
-        chosen.append(own[:: max(1, -(-len(own) // _PER_DIRECTION))])
-    return np.concatenate(chosen)
+    alike = (rows[direction == number] for number in range(6))
+    return np.concatenate([thin(own, _PER_DIRECTION) for own in alike])
 
 
 def _determined(normals: FloatArray, thickness: FloatArray, chosen: IntArray) -> FloatArray:

@@ -162,9 +162,8 @@ class Submaps:
         used = _near([(one, pose) for _, _, pose, one, _ in self._scans], origin)
         held = _near([(one, pose) for _, _, pose, _, one in self._scans], origin)
         planes = SubmapPlanes.of(used)
-        above = (np.abs(planes.normals[:, 2]) > _LEVEL) & (planes.centres[:, 2] > 0.3)
-        ground = (np.abs(planes.normals[:, 2]) > _LEVEL) & (planes.centres[:, 2] < -0.3)
-        covered = bool(above.sum() > 0.3 * ground.sum())
+        heights = planes.centres[np.abs(planes.normals[:, 2]) > _LEVEL, 2]
+        covered = bool((heights > 0.3).sum() > 0.3 * (heights < -0.3).sum())
         self.done.append(
             Submap(row, along_m, origin, planes, SubmapPlanes.of(held), _upright(used), covered)
         )

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
@@ -107,13 +107,15 @@ class Track:
 
     def pose(self, frame: int) -> Transform | None:
         """Return (4, 4) world_T_actor at a frame; None if the track does not extend to it."""
-        row = frame - self.first
-        return self.world_T_actor[row] if 0 <= row < len(self.world_T_actor) else None
+        return self._at(self.world_T_actor, frame)
 
     def velocity_at(self, frame: int) -> FloatArray | None:
         """Return (3,) m/s, world, at a frame; None if the track does not extend to it."""
+        return self._at(self.velocity, frame)
+
+    def _at(self, values: FloatArray, frame: int) -> FloatArray | None:
         row = frame - self.first
-        return self.velocity[row] if 0 <= row < len(self.velocity) else None
+        return values[row] if 0 <= row < len(values) else None
 
     def between(self, first: int, last: int) -> Track:
         """Return the track at the frames from `first` to `last` only, which is small enough to send
@@ -526,12 +528,8 @@ class MovingActors:
             about = parse_json(file.read("about", ArrayFormat(("u1",), (None,))).tobytes(), where)
         with reading(where, "tracks written by regrid", "remove it"):
             tracks = _tracks(arrays)
-            ends = np.cumsum(arrays["moving_frames"][:, 1])[:-1]
-            parts = np.split(arrays["moving"], ends)
-            moving = {
-                int(frame): own
-                for (frame, _), own in zip(arrays["moving_frames"], parts, strict=False)
-            }
+            moved = _divided(arrays["moving"], arrays["moving_frames"], 1)
+            moving = {frame: own for (frame, _), own in moved}
             summary = tuple(about["summary"])
             own = tuple(arrays["own"])
             seen = int(about["seen"])
@@ -552,23 +550,27 @@ def is_doubtful(confidence: float) -> bool:
 
 
 def _tracks(arrays: Mapping[str, AnyArray]) -> dict[int, Track]:
+    table, frames = arrays["table"], arrays["frames"]
     members: dict[int, dict[int, AnyIntArray]] = {}
-    offset = 0
-    for number, frame, count in arrays["frames"].tolist():
-        members.setdefault(number, {})[frame] = arrays["members"][offset : offset + count]
-        offset += count
-    tracks, row, point = {}, 0, 0
-    for (number, label, instance, first, length, points, rigid, size), bounds in zip(
-        arrays["table"].tolist(), arrays["bounds"], strict=True
+    for (number, frame, _), own in _divided(arrays["members"], frames, 2):
+        members.setdefault(number, {})[frame] = own
+    tracks = {}
+    for (row, poses), (_, velocity), (_, surface), bounds in zip(
+        _divided(arrays["poses"], table, 4),
+        _divided(arrays["velocities"], table, 4),
+        _divided(arrays["surfaces"], table, 7),
+        arrays["bounds"],
+        strict=True,
     ):
+        number, label, instance, first, _, points, rigid, _ = row
         rear, front, low, high = (bounds[12:16] > 0).tolist()
         tracks[number] = Track(
             label,
             instance,
             members.get(number, {}),
             first,
-            arrays["poses"][row : row + length],
-            arrays["velocities"][row : row + length],
+            poses,
+            velocity,
             bounds[0:3],
             bounds[3:6],
             Extent(
@@ -579,11 +581,16 @@ def _tracks(arrays: Mapping[str, AnyArray]) -> dict[int, Track]:
                 tuple(bounds[16:19].tolist()),
             ),
             bool(rigid),
-            arrays["surfaces"][point : point + size],
+            surface,
             float(bounds[19]),
         )
-        row, point = row + length, point + size
     return tracks
+
+
+def _divided(values: AnyArray, rows: AnyArray, count: int) -> Iterator[tuple[list[int], AnyArray]]:
+    """Yield the rows of a table, each with its values, of which a column has the number."""
+    parts = np.split(values, np.cumsum(rows[:, count])[:-1])
+    return zip(rows.tolist(), parts, strict=False)  # without rows, there is one empty part
 
 
 def _summarize(track: Track) -> dict[str, Any]:
