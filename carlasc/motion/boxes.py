@@ -135,8 +135,7 @@ def tracks_from_boxes(
         for row, track in enumerate(boxes[frame].tracks.tolist()):
             places.setdefault(track, []).append((frame, row))
     world = {frame: boxes[frame].transform(poses[frame]) for frame in boxes}
-    known = np.array(sorted(times), np.int64)
-    seconds = np.array([times[frame] for frame in known.tolist()])
+    known, seconds = (np.array(values) for values in zip(*sorted(times.items()), strict=True))
     return [
         _make_track(track, part, known, seconds, deformable)
         for track in sorted(places)
@@ -384,10 +383,8 @@ def register_boxes(track: Track, segments: Sequence[Segment], times: Mapping[int
     own = np.column_stack([multiply(axes, change[:, :3, None])[:, :, 0], change[:, 3]])
     own -= np.average(own, axis=0, weights=[len(some) for some in points])
     every = np.arange(len(poses))
-    x, y, z, yaw = (np.interp(every, rows, own[:, axis]) for axis in range(4))
+    *place, yaw = (np.interp(every, rows, column) for column in own.T)
     moved = np.stack([rotation_z(angle) for angle in yaw])
-    moved[:, :3, 3] = np.column_stack([x, y, z])
-    faster = np.column_stack(
-        [np.interp(every, rows, rates[:, axis], left=0, right=0) for axis in range(3)]
-    )
+    moved[:, :3, 3] = np.column_stack(place)
+    faster = np.column_stack([np.interp(every, rows, r, left=0, right=0) for r in rates.T[:3]])
     return replace(track, world_T_actor=multiply(poses, moved), velocity=track.velocity + faster)

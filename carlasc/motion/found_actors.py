@@ -433,12 +433,12 @@ class _ActorChain:
         samples = [segment.points for segment in segments]
         if path is None or length_of(samples) < _LONG_M or np.ptp(path[2]) < _BENDS_RAD:
             return actor, []
-        along = [points[:, 0] for points in in_body(samples, path)]
+        along = [points[:, 0] for points in in_body(samples, path[0], path[2])]
         middle = np.quantile(np.concatenate(along), (_END, 1 - _END)).mean()
         rear = [own < middle for own in along]
         halves = [points[own] for points, own in zip(samples, rear, strict=True)]
         behind = estimate_path(halves, self.seconds, rigid=True)
-        across = [points[:, 1] for points in in_body(samples, behind)]
+        across = [points[:, 1] for points in in_body(samples, behind[0], behind[2])]
         shown = np.concatenate([y[own] for y, own in zip(across, rear, strict=True)])
         low, high = np.quantile(shown, (_END, 1 - _END))
         beside = [(y < low - _ASIDE_M) | (y > high + _ASIDE_M) for y in across]

@@ -59,15 +59,12 @@ def ground_points(points: AnyFloatArray) -> BoolArray:
     """
     own = np.ascontiguousarray(points[:, :3], np.float32)
     known = finite(own)
-    if not known.all():
-        ground = np.zeros(len(own), np.bool_)
-        ground[known] = ground_points(own[known])
-        return ground
+    ground, own = np.zeros(len(own), np.bool_), own[known]
     sector, ring, lowest = _lowest(own)
     plane = _plane(own, lowest)
-    if plane is None:
-        return np.zeros(len(own), np.bool_)
-    return _ground(own, sector, ring, lowest, plane)
+    if plane is not None:
+        ground[known] = _ground(own, sector, ring, lowest, plane)
+    return ground
 
 
 def ground_height(points: AnyFloatArray) -> float:

@@ -219,8 +219,7 @@ def close_loops(submaps: Sequence[Submap], poses: FloatArray) -> tuple[FloatArra
     distances = []
     for first, second, *_ in loops:
         one, other = chosen[first], chosen[second]
-        now = multiply(invert(solved[first]), solved[second])
-        was = multiply(invert(start[first]), start[second])
+        was, now = (multiply(invert(way[first]), way[second]) for way in (start, solved))
         pairs = _matches(submaps[one].held, submaps[other].held, now, _SAME_M)
         if len(pairs[0]):
             apart = [
@@ -308,9 +307,7 @@ def _positions(
     for image, yaw in zip(images[1:], yaws.tolist(), strict=True):
         turned = transform_points(rotation_z(yaw), middles)[:, :2]
         image[tuple(cells_of(turned, _PIXEL_M).T + _PIXELS // 2)] = 1.0
-    waves = np.fft.rfft2(images)
-    overlap = np.fft.irfft2(waves[0] * waves[1:].conj(), s=images.shape[1:]).round()
-    shifts = np.fft.fftfreq(_PIXELS, 1.0 / _PIXELS) * _PIXEL_M
+    overlap, shifts = overlaps(images[:1], images[1:], _PIXEL_M)
     x, y = shifts[:, None] - given[0, 3], shifts - given[1, 3]
     best, which = overlap.max(axis=0), overlap.argmax(axis=0)
     best[np.hypot(x, y) > 2 * window + _MARGIN_M] = 0.0
@@ -323,6 +320,18 @@ def _positions(
         motion[:3, 3] = shifts[row], shifts[column], given[2, 3]
         yield motion
         best[np.hypot(shifts[:, None] - shifts[row], shifts - shifts[column]) < _PEAK_M] = 0.0
+
+
+def overlaps(
+    images: FloatArray, others: FloatArray, pixel_m: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return (N, P, P) how many pixels (N, P, P) images of zeros and ones share with the others, if
+    these are shifted in circles along both axes, and the (P,) shifts along an axis, metres.
+    """
+    count = images.shape[-1]
+    waves = np.fft.rfft2(images) * np.fft.rfft2(others).conj()
+    shared = np.fft.irfft2(waves, s=(count, count)).round()
+    return shared, np.fft.fftfreq(count, 1.0 / count) * pixel_m
 
 
 def _rise(one: SubmapPlanes, other: SubmapPlanes, motion: Transform, most: float) -> float:
@@ -494,8 +503,8 @@ def _add(
         small_motions(multiply(poses[j], invert(should))[None])[0, 3:],
     )
     x, y, z = should[:3, 3] - poses[i, :3, 3]
-    slope = np.zeros((6, 12))  # of `off` by the steps of the two poses: see `move`
-    slope[:, 6:], slope[:, :6] = np.eye(6), -np.eye(6)
+    # of `off` by the steps of the two poses: see `move`
+    slope = np.hstack([-np.eye(6), np.eye(6)])
     slope[:3, 3:6] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
     weights = error**-2.0
     rows = np.append(np.arange(6 * i, 6 * i + 6), np.arange(6 * j, 6 * j + 6))

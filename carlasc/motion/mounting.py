@@ -129,13 +129,13 @@ def find_mounting(
         information = squares_of(slope.reshape(-1, 7), weights.reshape(-1))
         # values that are not determined stay zero
         information += np.diag((10.0 * _DETERMINED) ** -2.0)
-        right = -(weights[:, :, None] * slope * scaled[:, :, None]).sum(axis=(0, 1))
-        step = solve_positive(information.copy(), right)
+        pulls = weights[:, :, None] * slope * scaled[:, :, None]
+        step = solve_positive(information.copy(), -pulls.sum(axis=(0, 1)))
         values = np.clip(values + step, -_LIMITS, _LIMITS)
     inverse = np.stack([solve_positive(information.copy(), row) for row in np.eye(7)])
     # Drift and distortion make errors that motions within some seconds share, so their sums vary
     # more than those of independent ones. Few sums need a wider interval (Student's t).
-    pulls = (weights[:, :, None] * slope * scaled[:, :, None]).sum(axis=1)
+    pulls = pulls.sum(axis=1)
     shared = np.concatenate([part.groups + 1j * row for row, part in enumerate(parts)])
     sums = np.stack([pulls[shared == group].sum(axis=0) for group in np.unique(shared)])
     more = max(len(sums) - 1, 1)

@@ -32,6 +32,7 @@ from carlasc.core.scans import finite, lengths
 from carlasc.errors import ArgumentError, import_extra
 from carlasc.motion.ground import ground_height, ground_points
 from carlasc.motion.joint_alignment import AlignmentPass, align
+from carlasc.motion.loops import overlaps
 from carlasc.running.spreading import Progress
 
 MIN_POINTS = 100  # scans with fewer points do not determine the motion
@@ -343,9 +344,8 @@ def _likely_shift(above: Sequence[IntArray], reach_m: float) -> FloatArray:
     images = np.zeros((len(above), _CELLS, _CELLS))
     for image, cells in zip(images, above, strict=True):
         image[tuple(cells.T)] = 1.0
-    waves = np.fft.rfft2(images)
-    overlap = np.fft.irfft2((waves[:-1] * waves[1:].conj()).sum(axis=0), s=images.shape[1:]).round()
-    shifts = np.fft.fftfreq(_CELLS, 1.0 / _CELLS) * _CELL_M
+    shared, shifts = overlaps(images[:-1], images[1:], _CELL_M)
+    overlap = shared.sum(axis=0)
     overlap[np.hypot(shifts[:, None], shifts) > reach_m] = -1.0
     x, y = np.unravel_index(np.argmax(overlap), overlap.shape)
     return np.array([shifts[x], shifts[y]])

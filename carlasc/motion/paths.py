@@ -199,11 +199,13 @@ def estimate_path(
     )
 
 
-def in_body(observations: Sequence[FloatArray], path: Path) -> list[FloatArray]:
+def in_body(
+    observations: Sequence[FloatArray], positions: FloatArray, headings: FloatArray
+) -> list[FloatArray]:
     """Return the (M, 3) points of each observation of an actor, metres, actor frame."""
     return [
         multiply(points - place, rotation_z(heading)[:3, :3])
-        for points, place, heading in zip(observations, path[0], path[2], strict=True)
+        for points, place, heading in zip(observations, positions, headings, strict=True)
     ]
 
 
@@ -236,7 +238,7 @@ def misalignment(
         are NaN for a single observation.
     """
     thinned = [thin(points, _POINTS) for points in observations]
-    body, means = in_body(thinned, path), []
+    body, means = in_body(thinned, path[0], path[2]), []
     for i in np.unique(np.linspace(0, len(seconds) - 1, _PAIRS).astype(int)):
         j = int(np.argmin(np.abs(np.abs(seconds - seconds[i]) - _APART_S)))
         if j != i:

@@ -243,10 +243,9 @@ def refine_poses(
                 measures = before[:end], after[:end], refined[:end], fits[:end]
                 keep(RefinedPoses(given[:end], poses[:end], *measures))
         if submaps is not None:
-            for row, scan, pose in zip(
-                range(begin, end), kept[rows], poses[begin:end], strict=True
-            ):
-                submaps.add(row, scan.used, scan.measured, pose)
+            for row in range(begin, end):
+                scan = kept[row - start]
+                submaps.add(row, scan.used, scan.measured, poses[row])
         begin = end
     # Beside vehicles that move along, poses may seem not to fit: one such stretch bars no loop.
     if submaps is not None and fits.mean() > 0.5:

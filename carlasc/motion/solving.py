@@ -257,8 +257,10 @@ def resample(
     Returns:
         (A, 3) positions and (A, 3) velocities.
     """
-    path = np.stack([np.interp(at, seconds, positions[:, axis]) for axis in range(3)], axis=1)
-    speed = np.stack([np.interp(at, seconds, velocities[:, axis]) for axis in range(3)], axis=1)
+    path, speed = (
+        np.column_stack([np.interp(at, seconds, column) for column in values.T])
+        for values in (positions, velocities)
+    )
     beyond = np.minimum(at - seconds[0], 0) + np.maximum(at - seconds[-1], 0)
     return path + speed * beyond[:, None], speed
 

@@ -25,7 +25,6 @@ from carlasc.core.geometry import (
     Transform,
     invert,
     multiply,
-    rotate_vectors,
     rotation_z,
     transform_each,
 )
@@ -34,7 +33,9 @@ from carlasc.motion.bodies import BODY_MARGIN_M, Extent, Sizes, measure, surface
 from carlasc.motion.paths import (
     Path,
     Segment,
+    ends,
     headings_of_vehicle,
+    in_body,
     is_static,
     length_of,
     path_of,
@@ -49,7 +50,6 @@ _STATIC_M = 0.5  # the visible part of a static actor may seem to move this far
 # No actor, with its margins, is longer, wider or higher: a larger one has points of other things.
 LONGEST_M, _WIDEST_M, _HIGHEST_M = 30.0, 4.2, 5.0
 _SURE = 0.8  # actors with less confidence are doubtful
-_END = 0.02  # share of the points of a scan beyond each end of what it shows
 _ASIDE = 0.1  # weight of an end that is not turned to the sensor
 _AGREE_M = 0.5  # an end that is farther from its usual place is that of a part of the actor
 _ROUNDS, _TURNS_RAD = 3, 0.1
@@ -285,13 +285,10 @@ def _visible_ends(
         y, metres, actor frame, and (F, 2, 2) how much each is turned to the sensor.
     """
     turns = np.stack([rotation_z(heading) for heading in headings])
-    backwards, ends = invert(turns), list[FloatArray]()
-    for segment, turn, position in zip(chain, backwards, positions, strict=True):
-        own = rotate_vectors(turn, segment.points - position)[:, :2]
-        ends.append(np.quantile(own, (_END, 1 - _END), axis=0))
+    body = in_body([segment.points for segment in chain], positions, headings)
+    faces = np.array([ends(points[:, :2]) for points in body])
     origins = np.stack([segment.origin for segment in chain]) - positions
-    places = multiply(backwards[:, :3, :3], origins[..., None])[:, None, :2, 0]
-    faces = np.array(ends)
+    places = multiply(invert(turns)[:, :3, :3], origins[..., None])[:, None, :2, 0]
     beyond = (np.median(faces, axis=0) - places) * np.array([[1], [-1]])
     distance = np.maximum(np.linalg.norm(places, axis=2, keepdims=True), 1e-6)
     return turns[:, :2, :2], faces, _ASIDE + np.clip(beyond / distance, 0, 1)
@@ -393,8 +390,7 @@ def _frames_around(
 
     Frames without a scan are interpolated, and extrapolated by the mean period.
     """
-    known = np.array(sorted(times))
-    seconds = np.array([times[int(frame)] for frame in known])
+    known, seconds = (np.array(values) for values in zip(*sorted(times.items()), strict=True))
     period = (
         float(seconds[-1] - seconds[0]) / float(known[-1] - known[0]) if len(known) > 1 else 0.1
     )
