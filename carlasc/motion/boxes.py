@@ -255,7 +255,6 @@ def _make_track(
     """
     seconds, centers = boxes.seconds, boxes.poses[:, :3, 3]
     headings, tilt = _headings_and_tilt(boxes.poses[:, :3, :3])
-    frames, at = known, known_seconds
     path, speed = smooth(centers, seconds, boxes.weights, _SMOOTH_S)
     static = _is_static(path, centers, seconds)
     if static:
@@ -264,9 +263,10 @@ def _make_track(
         turns = np.full(len(seconds), np.median(headings))
     else:
         turns = smooth(headings[:, None], seconds, boxes.weights, _SMOOTH_S)[0][:, 0]
+    frames = known
     if not static or seconds[-1] - seconds[0] < _HOLD_S:
-        inside = (at > seconds[0] - _EXTRAPOLATE_S) & (at < seconds[-1] + _EXTRAPOLATE_S)
-        frames = frames[inside]
+        start, end = seconds[0] - _EXTRAPOLATE_S, seconds[-1] + _EXTRAPOLATE_S
+        frames = known[(known_seconds > start) & (known_seconds < end)]
     every = np.arange(frames[0], frames[-1] + 1)
     at = np.interp(every, known, known_seconds)
     if static:  # all frames share the memory of one pose

@@ -66,7 +66,7 @@ def other_passes(positions: FloatArray, seconds: FloatArray) -> dict[int, list[I
         seconds: (F,) times.
     """
     steps = np.sqrt(np.square(np.diff(positions, axis=0)).sum(axis=1))
-    along = np.concatenate([np.zeros(1), np.cumsum(steps)])
+    along = np.append(0.0, np.cumsum(steps))
     used = np.unique(np.floor(along / _STEP_M), return_index=True)[1]
     found = dict[int, list[IntArray]]()
     for row in used.tolist():

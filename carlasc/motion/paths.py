@@ -117,9 +117,8 @@ class Segment:
         """Return this segment with the points of another one of the scan too."""
         members = np.concatenate([self.members, other.members])
         points = np.concatenate([self.points, other.points])
-        if self.times is None or other.times is None:
-            return replace(self, members=members, points=points, times=None)
-        times = np.concatenate([self.times, other.times])
+        known = self.times is not None and other.times is not None
+        times = np.concatenate([self.times, other.times]) if known else None
         return replace(self, members=members, points=points, times=times)
 
     def at_frame(self, velocity: FloatArray) -> Segment:

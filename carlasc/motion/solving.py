@@ -155,11 +155,9 @@ def principal_axes(
                     _turn(a.T, p, q, cos, sin)
                     _turn(v, p, q, cos, sin)
         # The diagonal has no order; the normal of a plane is the vector of the smallest value.
-        order = np.argsort(np.array([a[0, 0], a[1, 1], a[2, 2]]))
-        for k in range(3):
-            values[n, k] = a[order[k], order[k]]
-            for i in range(3):
-                vectors[n, i, k] = v[i, order[k]]
+        diagonal = np.diag(a)
+        order = np.argsort(diagonal)
+        values[n], vectors[n] = diagonal[order], v[:, order]
     return values, vectors
 
 
