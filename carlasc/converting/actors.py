@@ -157,8 +157,8 @@ def _velocities_of(chain: _ObservationChain, classes: ClassTable) -> list[Veloci
         transform_points(pose, points) for pose, points in zip(poses, chain.points, strict=True)
     ]
     rigid = chain.label not in classes.deformable
-    positions, velocities, headings = estimate_path(observations, seconds, rigid=rigid)
-    if not classes.moving and is_static(observations, positions, headings, seconds):
+    path = _, velocities, _ = estimate_path(observations, seconds, rigid=rigid)
+    if not classes.moving and is_static(observations, path, seconds):
         velocities = np.zeros_like(velocities)
     own = multiply(invert(poses)[:, :3, :3], velocities[:, :, None])[:, :, 0]
     return [(x, y, z) for x, y, z in own.tolist()]

@@ -166,6 +166,11 @@ def fast_azimuth(x: float, y: float) -> float:
     return -angle if y < 0.0 else angle
 
 
+def cells_of(points: AnyFloatArray, size: float) -> IntArray:
+    """Return the numbers of the cells of a size that (..., D) points are in, along each axis."""
+    return np.floor(points / size).astype(np.int64)
+
+
 def run_starts(numbers: AnyIntArray) -> IntArray:
     """Return the first index of each run of equal numbers, which are 0 or more."""
     return np.flatnonzero(np.diff(numbers, prepend=-1))

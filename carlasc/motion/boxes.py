@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from carlasc.core.arrays import FloatArray, IntArray, LabelArray
+from carlasc.core.arrays import BoolArray, FloatArray, IntArray, LabelArray
 from carlasc.core.boxes import Boxes, mirror_boxes
 from carlasc.core.geometry import (
     Transform,
@@ -135,8 +135,7 @@ def tracks_from_boxes(
         for row, track in enumerate(boxes[frame].tracks.tolist()):
             places.setdefault(track, []).append((frame, row))
     world = {frame: boxes[frame].transform(poses[frame]) for frame in boxes}
-    known = np.array(sorted(times), np.int64)
-    seconds = np.array([times[frame] for frame in known.tolist()])
+    known, seconds = (np.array(values) for values in zip(*sorted(times.items()), strict=True))
     return [
         _make_track(track, part, known, seconds, deformable)
         for track in sorted(places)
@@ -212,22 +211,15 @@ def segment_by_boxes(
 
 
 def _inside(
-    track: Track,
-    pose: Transform,
-    points: FloatArray,
-    labels: LabelArray | None,
-) -> IntArray:
-    """Return the indices of the (M, 3) points, world, that are in a track's box at a pose and above
-    its ground.
-    """
-    reach = np.linalg.norm(np.maximum(np.abs(track.lower), np.abs(track.upper)), axis=0)
-    near = np.flatnonzero(np.abs(points[:, 1] - pose[1, 3]) <= reach)
-    body = transform_points(invert(pose), points[near])
+    track: Track, pose: Transform, points: FloatArray, labels: LabelArray | None
+) -> BoolArray:
+    """Return which of (M, 3) points, world, are in a track's box at a pose and above its ground."""
+    body = transform_points(invert(pose), points)
     inside = ((body >= track.lower) & (body <= track.upper)).all(axis=1)
     above = body[:, 2] > track.lower[2] + BODY_MARGIN_M + _FLOOR_M
     if labels is not None:
-        above |= labels[near] == track.label
-    return near[inside & above]
+        above |= labels == track.label
+    return inside & above
 
 
 def _boxes_of(places: list[tuple[int, Boxes, int]], times: Mapping[int, float]) -> _ObjectBoxes:
@@ -263,7 +255,6 @@ def _make_track(
     """
     seconds, centers = boxes.seconds, boxes.poses[:, :3, 3]
     headings, tilt = _headings_and_tilt(boxes.poses[:, :3, :3])
-    frames, at = known, known_seconds
     path, speed = smooth(centers, seconds, boxes.weights, _SMOOTH_S)
     static = _is_static(path, centers, seconds)
     if static:
@@ -272,9 +263,10 @@ def _make_track(
         turns = np.full(len(seconds), np.median(headings))
     else:
         turns = smooth(headings[:, None], seconds, boxes.weights, _SMOOTH_S)[0][:, 0]
+    frames = known
     if not static or seconds[-1] - seconds[0] < _HOLD_S:
-        inside = (at > seconds[0] - _EXTRAPOLATE_S) & (at < seconds[-1] + _EXTRAPOLATE_S)
-        frames = frames[inside]
+        start, end = seconds[0] - _EXTRAPOLATE_S, seconds[-1] + _EXTRAPOLATE_S
+        frames = known[(known_seconds > start) & (known_seconds < end)]
     every = np.arange(frames[0], frames[-1] + 1)
     at = np.interp(every, known, known_seconds)
     if static:  # all frames share the memory of one pose
@@ -391,10 +383,8 @@ def register_boxes(track: Track, segments: Sequence[Segment], times: Mapping[int
     own = np.column_stack([multiply(axes, change[:, :3, None])[:, :, 0], change[:, 3]])
     own -= np.average(own, axis=0, weights=[len(some) for some in points])
     every = np.arange(len(poses))
-    x, y, z, yaw = (np.interp(every, rows, own[:, axis]) for axis in range(4))
+    *place, yaw = (np.interp(every, rows, column) for column in own.T)
     moved = np.stack([rotation_z(angle) for angle in yaw])
-    moved[:, :3, 3] = np.column_stack([x, y, z])
-    faster = np.column_stack(
-        [np.interp(every, rows, rates[:, axis], left=0, right=0) for axis in range(3)]
-    )
+    moved[:, :3, 3] = np.column_stack(place)
+    faster = np.column_stack([np.interp(every, rows, r, left=0, right=0) for r in rates.T[:3]])
     return replace(track, world_T_actor=multiply(poses, moved), velocity=track.velocity + faster)

@@ -35,12 +35,22 @@ from carlasc.core.arrays import (
     LabelArray,
     Uint32Array,
 )
-from carlasc.core.cells import Pose, as_pose, distinct, fast_azimuth, joined, numbered, transform
+from carlasc.core.cells import (
+    Pose,
+    as_pose,
+    cells_of,
+    distinct,
+    fast_azimuth,
+    joined,
+    numbered,
+    transform,
+)
 from carlasc.core.compiling import cached, inlined
-from carlasc.core.geometry import Transform, invert, multiply, spread_rows, thin, transform_points
+from carlasc.core.geometry import Transform, invert, multiply, transform_points
 from carlasc.core.scans import finite, runs_of_origins
 from carlasc.errors import FormatError
 from carlasc.motion.ground import ground_points
+from carlasc.motion.paths import Segment
 
 HORIZON_S = 5.0  # fact: horizon
 """Scans up to this many seconds before and after a scan are looked up."""
@@ -105,6 +115,24 @@ class EvidenceScan:
                 raise FormatError(name, expected=f"shape ({len(self.points)},)", found=values.shape)
 
 
+class MovedCluster(NamedTuple):
+    """Points of a scan that moved together.
+
+    Attributes:
+        segment: the points, without velocity; its class is 0 without labels.
+        freed: number of points at places that were free at other times.
+        passed: number of them at places that were free most of the time, not on one side in time
+            only, as behind edges.
+        around: number of static points around it, at its height. It is large for pieces of static
+            objects.
+    """
+
+    segment: Segment
+    freed: int
+    passed: int
+    around: int
+
+
 @dataclass(frozen=True)
 class FreeSpaceEvidence:
     """The clusters of points that moved in one scan.
@@ -113,44 +141,26 @@ class FreeSpaceEvidence:
         frame: frame number.
         seconds: time of the scan.
         count: number of points of the scan.
-        clusters: (M,) int64 indices of the points of each cluster.
-        points: (M, 3) float64 of the same points, metres, world.
-        labels: most frequent class of each cluster; 0 without labels.
-        freed: number of points of each cluster at places that were free at other times.
-        passed: number of them at places that were free most of the time, not on one side in time
-            only, as behind edges.
-        around: number of static points around each cluster, at its height. It is large for pieces
-            of static objects.
+        clusters: the clusters.
         world_T_sensor: (4, 4) pose of the scan.
         near: (K,) cells of the points around the sensor that are not ground: see `cells_around`.
-        times: seconds of the `points` after the time of the scan; empty if they are unknown.
         ground_m: height of the ground around the sensor, metres, sensor frame; NaN without any.
     """
 
     frame: int
     seconds: float
     count: int
-    clusters: tuple[IntArray, ...]
-    points: tuple[FloatArray, ...]
-    labels: tuple[int, ...]
-    freed: tuple[int, ...]
-    passed: tuple[int, ...]
-    around: tuple[int, ...]
+    clusters: tuple[MovedCluster, ...]
     world_T_sensor: Transform
     near: IntArray
-    times: tuple[AnyFloatArray, ...] = ()
     ground_m: float = math.nan
 
     def thinned(self, most: int = 2000) -> FreeSpaceEvidence:
-        """Return the same with at most `most` of the `points` of each cluster; `clusters` stay
+        """Return the same with at most `most` of the points of each cluster; members stay
         complete.
         """
-        if not self.times:
-            return replace(self, points=tuple(thin(points, most) for points in self.points))
-        rows = [spread_rows(len(points), most) for points in self.points]
-        points = tuple(own[kept] for own, kept in zip(self.points, rows, strict=True))
-        times = tuple(own[kept] for own, kept in zip(self.times, rows, strict=True))
-        return replace(self, points=points, times=times)
+        thin = (one._replace(segment=one.segment.thinned(most)) for one in self.clusters)
+        return replace(self, clusters=tuple(thin))
 
 
 @dataclass(frozen=True)
@@ -251,7 +261,7 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     world = transform_points(scan.world_T_sensor, scan.points[candidates].astype(np.float64))
     # One point per small cell is looked up: the others of the cell are of the same surface, and
     # looking up costs most of the time.
-    asked_first, same = numbered(np.floor(world / _JUDGED_CELL_M).astype(np.int64))
+    asked_first, same = numbered(cells_of(world, _JUDGED_CELL_M))
     verdict = _judge(
         scan, candidates[asked_first], [window[i] for i in before], [window[i] for i in after]
     )
@@ -261,22 +271,21 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
         labels = scan.labels[candidates].astype(np.int64)
         kind = np.where(np.isin(labels, sorted(movable)), labels, 0)
     groups = _clusters(world, kind, moved, left, static, stays)
-    freed, passed = (
-        tuple(int(flags[group].sum()) for group in groups) for flags in (moved | left, moved)
-    )
-    clusters = [candidates[group] for group in groups]
-    points = [world[group] for group in groups]
-    classes = [
-        0 if scan.labels is None else int(np.bincount(scan.labels[own]).argmax())
-        for own in clusters
-    ]
-    around = _count_around(world, groups, static)
-    parts = (tuple(clusters), tuple(points), tuple(classes), freed, passed, around)
+    clusters = []
+    for group, around in zip(groups, _count_around(world, groups, static), strict=True):
+        members = candidates[group]
+        label = 0 if scan.labels is None else int(np.bincount(scan.labels[members]).argmax())
+        times = None if scan.times is None else scan.times[members]
+        origin = scan.world_T_sensor[:3, 3]
+        segment = Segment(
+            scan.frame, label, members, world[group], None, origin=origin, times=times
+        )
+        freed, passed = (int(flags[group].sum()) for flags in (moved | left, moved))
+        clusters.append(MovedCluster(segment, freed, passed, around))
     near = cells_around(scan.points[candidates])
-    times = () if scan.times is None else tuple(scan.times[members] for members in clusters)
     below = scan.points[ground & (np.abs(scan.points[:, :2]) < _AROUND_M).all(axis=1), 2]
     height = float(np.median(below)) if len(below) else math.nan
-    about = *parts, scan.world_T_sensor, near, times, height
+    about = tuple(clusters), scan.world_T_sensor, near, height
     return FreeSpaceEvidence(scan.frame, own.seconds, len(scan.points), *about)
 
 
@@ -287,7 +296,7 @@ def cells_around(points: AnyFloatArray) -> IntArray:
     near = points[(np.abs(points) < OWN_REACH_M).all(axis=1)]
     if not len(near):
         return np.empty(0, np.int64)
-    cells = np.floor(near / OWN_CELL_M).astype(np.int64) + OWN_CELLS // 2
+    cells = cells_of(near, OWN_CELL_M) + OWN_CELLS // 2
     flags = np.zeros(OWN_CELLS**3, np.bool_)  # faster than `np.unique`
     flags[np.ravel_multi_index(tuple(cells.T), (OWN_CELLS,) * 3, mode="clip")] = True
     return np.flatnonzero(flags)
@@ -391,7 +400,7 @@ def _clusters(
     flagged = np.flatnonzero(either)
     if len(flagged) < _MIN_POINTS:
         return []
-    cell = np.floor(world[:, :2] / _CELL_M).astype(np.int64)
+    cell = cells_of(world[:, :2], _CELL_M)
     low, high = cell[flagged].min(axis=0) - 1, cell[flagged].max(axis=0) + 1
     x, y = ((axis >= a) & (axis <= b) for axis, a, b in zip(cell.T, low, high, strict=True))
     inside = np.flatnonzero(x & y)
@@ -429,7 +438,7 @@ def _count_around(world: FloatArray, groups: list[IntArray], static: BoolArray) 
     cells or beside them, at its height.
     """
     # Row and column in one number, so that neighbours are at fixed steps: 2^20 cells are 367 km.
-    cell = np.floor(world[:, :2] / _CELL_M).astype(np.int64) + (1 << 20)
+    cell = cells_of(world[:, :2], _CELL_M) + (1 << 20)
     key, rows = (cell[:, 0] << 21) | cell[:, 1], np.flatnonzero(static)
     rows = rows[np.argsort(key[rows], kind="stable")]
     keys = key[rows]
@@ -630,11 +639,8 @@ def look_up(
     for i in asked:
         x, y, z = transform(pose, float(points[i, 0]), float(points[i, 1]), float(points[i, 2]))
         # from there, the point is in a column near this one, with nearly the same origin
-        if moved and x * x + y * y > 0:
-            place = origin[_column(fast_azimuth(x, y))]
-            x, y, z = x - place[0], y - place[1], z - place[2]
-        else:
-            x, y, z = x - origin[0, 0], y - origin[0, 1], z - origin[0, 2]
+        c = _column(fast_azimuth(x, y)) if moved and x * x + y * y > 0 else 0
+        x, y, z = x - origin[c, 0], y - origin[c, 1], z - origin[c, 2]
         flat = math.sqrt(x * x + y * y)
         # Above, below and inside the vehicle, a direction says nothing about the place.
         if flat < _MIN_RANGE_M:
@@ -648,8 +654,9 @@ def look_up(
 
 
 @inlined
-def _count(bits: np.int64) -> np.int64:
+def _count(flags: np.uint32 | np.int64) -> np.int64:
     """Return how many of the lower 32 bits are set."""
+    bits = np.int64(flags)
     # Neighbouring bits are added in pairs, then in fours, then in bytes (Warren, "Hacker's
     # Delight", 5-1); the product adds the four bytes in the highest one.
     bits -= (bits >> 1) & 0x55555555
@@ -678,10 +685,10 @@ def undecided(
             such a place is decided.
     """
     kept = np.empty_like(asked)
-    count, rest = 0, _count(np.int64(left[0])) + _count(np.int64(left[1]))
+    count, rest = 0, _count(left[0]) + _count(left[1])
     for i in asked:
-        passed = _count(np.int64(free[0, i])) + _count(np.int64(free[1, i]))
-        occupied = _count(np.int64(hit[0, i])) + _count(np.int64(hit[1, i]))
+        passed = _count(free[0, i]) + _count(free[1, i])
+        occupied = _count(hit[0, i]) + _count(hit[1, i])
         # The rest of the scans can add at most `rest` to either count. A point is decided when no
         # such addition changes which count is greater, or the length of a row without a hit.
         moves = passed >= least[0] and passed > occupied + rest

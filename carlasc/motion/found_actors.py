@@ -17,7 +17,6 @@ from carlasc.core.geometry import (
     invert,
     multiply,
     rotation_z,
-    spread_rows,
     thin,
     transform_points,
 )
@@ -26,12 +25,14 @@ from carlasc.motion.evidence import (
     OWN_CELLS,
     OWN_REACH_M,
     FreeSpaceEvidence,
+    MovedCluster,
     cells_around,
 )
 from carlasc.motion.paths import (
     Path,
     Segment,
     estimate_path,
+    in_body,
     is_static,
     length_of,
     middles_of,
@@ -165,14 +166,9 @@ class ActorFollower:
         before it.
         """
         passed = (
-            members
-            for members, count, freed in zip(
-                scan.clusters,
-                scan.passed,
-                scan.freed,
-                strict=True,
-            )
-            if count >= _PASSED * freed
+            cluster.segment.members
+            for cluster in scan.clusters
+            if cluster.passed >= _PASSED * cluster.freed
         )
         moved = np.sort(np.concatenate([np.empty(0, np.int64), *passed]))
         self.moved[scan.frame] = moved.astype(np.int32)
@@ -181,16 +177,13 @@ class ActorFollower:
         if np.isfinite(scan.ground_m):
             self._grounds.append(scan.ground_m)
         self._near[scan.near] += 1
-        points = np.concatenate([np.empty((0, 3)), *scan.points])
-        local = transform_points(invert(scan.world_T_sensor), points)
-        inside = np.abs(local).max(axis=1) < OWN_REACH_M
-        ends = np.cumsum([0, *map(len, scan.points)])
-        for members, one, end in zip(scan.clusters, ends, ends[1:], strict=False):
-            if inside[one:end].any():
-                cells = cells_around(local[one:end])
-                self._freed[cells] += 1
-                if inside[one:end].all():
-                    self._close.append((scan.frame, members.astype(np.int32), cells))
+        sensor_T_world = invert(scan.world_T_sensor)
+        for segment, *_ in scan.clusters:
+            local = transform_points(sensor_T_world, segment.points)
+            cells = cells_around(local)
+            self._freed[cells] += 1
+            if len(cells) and np.abs(local).max() < OWN_REACH_M:
+                self._close.append((scan.frame, segment.members.astype(np.int32), cells))
         before, self._alive = self._alive, []
         ended = list[_ActorChain]()
         for one in before:
@@ -298,19 +291,11 @@ class _Link:
     world_T_sensor: Transform
 
     @classmethod
-    def of(cls, evidence: FreeSpaceEvidence, index: int) -> _Link:
-        points = evidence.points[index]
+    def of(cls, evidence: FreeSpaceEvidence, cluster: MovedCluster) -> _Link:
+        segment, freed, _, around = cluster
+        lower, upper = segment.points.min(axis=0), segment.points.max(axis=0)
         pose = evidence.world_T_sensor
-        freed = evidence.freed[index]
-        around = evidence.around[index]
-        members, label = evidence.clusters[index], evidence.labels[index]
-        times = evidence.times[index] if evidence.times else None
-        segment = Segment(
-            evidence.frame, label, members, points, None, origin=pose[:3, 3], times=times
-        )
-        return cls(
-            evidence.seconds, segment, points.min(axis=0), points.max(axis=0), freed, around, pose
-        )
+        return cls(evidence.seconds, segment, lower, upper, freed, around, pose)
 
     @property
     def middle(self) -> FloatArray:
@@ -321,27 +306,17 @@ class _Link:
         return self.segment.label
 
     def part(self, chosen: BoolArray) -> _Link:
-        """Return the observation of some of its points; members that were thinned out are where the
-        points beside them in the scan are.
-        """
-        one, points = self.segment, self.segment.points[chosen]
-        rows = spread_rows(len(one.members), len(one.points))
-        after = np.searchsorted(rows, np.arange(len(one.members)), side="right") - 1
-        members = one.members[chosen[np.maximum(after, 0)]]
-        times = None if one.times is None else one.times[chosen]
-        share = len(members) / len(one.members)
+        """Return the observation of some of its points."""
+        segment = self.segment.part(chosen)
+        share = len(segment.members) / len(self.segment.members)
         return replace(
             self,
-            segment=replace(one, members=members, points=points, times=times),
-            lower=points.min(axis=0),
-            upper=points.max(axis=0),
+            segment=segment,
+            lower=segment.points.min(axis=0),
+            upper=segment.points.max(axis=0),
             freed=round(self.freed * share),
             around=round(self.around * share),
         )
-
-    def thinned(self, most: int) -> _Link:
-        """Return the same with at most `most` points, within the same bounds."""
-        return replace(self, segment=self.segment.thinned(most))
 
     @property
     def is_small(self) -> bool:
@@ -357,64 +332,56 @@ class _Link:
 
     def joined(self, other: _Link) -> _Link:
         """Return the two as one observation."""
-        one, more = self.segment, other.segment
-        segment = replace(
-            one,
-            members=np.concatenate([one.members, more.members]),
-            points=np.concatenate([one.points, more.points]),
-            times=None
-            if one.times is None or more.times is None
-            else np.concatenate([one.times, more.times]),
+        return replace(
+            self,
+            segment=self.segment.joined(other.segment),
+            lower=np.minimum(self.lower, other.lower),
+            upper=np.maximum(self.upper, other.upper),
+            freed=self.freed + other.freed,
+            around=self.around + other.around,
         )
-        lower = np.minimum(self.lower, other.lower)
-        upper = np.maximum(self.upper, other.upper)
-        freed, around = self.freed + other.freed, self.around + other.around
-        return replace(self, segment=segment, lower=lower, upper=upper, freed=freed, around=around)
 
 
 class _ActorChain:
     """The observations of one actor in consecutive scans."""
 
-    def __init__(self, first: _Link) -> None:
-        self.links = [first]
-        # numbers of its last estimate and of the parts that were split from it
-        self.numbers: set[int] = set()
-        self.estimated_s = first.seconds  # of its last observation then; before: of the first one
-        self.velocity: FloatArray | None = (
-            None  # (3,) m/s over the last observations; None for a single one
-        )
-
-    def append(self, link: _Link) -> None:
-        """Continue the chain."""
-        self.links.append(link)
-        self.velocity = self._velocity()
+    def __init__(self, links: list[_Link], numbers: set[int]) -> None:
+        self.links = links
+        self.numbers = numbers  # of its last estimate and of the parts that were split from it
+        self.estimated_s = links[0].seconds  # of its last observation then; before: of the first
+        self.velocity = np.zeros(3)  # m/s over the last observations; 0 for a single one
 
     @property
     def last(self) -> _Link:
         return self.links[-1]
 
-    def _velocity(self) -> FloatArray:
+    @property
+    def seconds(self) -> FloatArray:
+        """(F,) times of the observations."""
+        return np.array([link.seconds for link in self.links])
+
+    def append(self, link: _Link) -> None:
+        """Continue the chain."""
+        self.links.append(link)
         recent = self.links[-_HISTORY:]
         seconds = np.array([link.seconds for link in recent])
         # The visible faces change: the velocities of the lower corner, the middle and the upper
         # corner are compared, and the lowest one counts.
         offsets = seconds - seconds.mean()
-        lower, upper = np.array([(link.lower, link.upper) for link in recent]).swapaxes(0, 1)
+        lower, upper = _bounds(recent)
         corners = np.stack([lower, (lower + upper) / 2, upper], axis=1)
         slopes = (offsets[:, None, None] * corners).sum(axis=0) / np.square(offsets).sum()
         least = np.take_along_axis(slopes, np.abs(slopes).argmin(axis=0)[None], axis=0)[0]
-        return np.where(np.abs(slopes).max(axis=0) > 0, (least + slopes[1]) / 2, 0.0)
+        self.velocity = np.where(np.abs(slopes).max(axis=0) > 0, (least + slopes[1]) / 2, 0.0)
 
     def shift(self, seconds: float) -> FloatArray:
         """Return (3,) how far the actor has come at a time since its last observation, metres."""
-        moved = np.zeros(3) if self.velocity is None else self.velocity
-        return moved * (seconds - self.last.seconds)
+        return self.velocity * (seconds - self.last.seconds)
 
     def is_apart(self, other: _ActorChain) -> bool:
         """Whether it cannot be a part of the same actor."""
         if self.last.is_whole and other.last.is_whole:
             return True
-        assert self.velocity is not None and other.velocity is not None
         return float(np.hypot(*(self.velocity - other.velocity)[:2])) > _APART_M_S
 
     def actor(
@@ -425,33 +392,31 @@ class _ActorChain:
         """
         if len(self.links) < _MIN_OBSERVATIONS:
             return None
-        seconds = np.array([link.seconds for link in self.links])
+        seconds = self.seconds
         segments = [link.segment for link in self.links]
         votes = np.bincount([s.label for s in segments], [len(s.members) for s in segments])
         label = int(votes.argmax()) or default_label
         sizes = np.quantile([link.upper - link.lower for link in self.links], 0.8, axis=0)
         rigid = label not in deformable if votes.argmax() and deformable else not _is_small(sizes)
-        path = positions, velocities, headings = path_of(segments, seconds, rigid=rigid)
+        path = positions, velocities, _ = path_of(segments, seconds, rigid=rigid)
         segments = [s.at_frame(v) for s, v in zip(segments, velocities, strict=True)]
         samples = [segment.points for segment in segments]
         speeds = np.linalg.norm(velocities[:, :2], axis=1)
-        if (
-            np.ptp(positions[:, :2], axis=0).max() < _MIN_PATH_M
-            or np.quantile(speeds, 0.9) < _MIN_SPEED_M_S
-        ):
+        extent = np.ptp(positions[:, :2], axis=0).max()
+        if extent < _MIN_PATH_M or np.quantile(speeds, 0.9) < _MIN_SPEED_M_S:
             return None
         length = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1).sum()
-        if np.ptp(positions[:, :2], axis=0).max() < _STRAIGHT * length:
-            still, moved = misalignment(samples, positions, headings, seconds)
+        if extent < _STRAIGHT * length:
+            still, moved = misalignment(samples, path, seconds)
             if not moved < _MANOEUVRES * still:
                 return None
         middles = np.stack([link.middle for link in self.links])
         steps = np.linalg.norm(np.diff(middles - positions, axis=0)[:, :2], axis=1) / np.diff(
             seconds
         )
-        if np.median(steps) > _MAX_JUMP_M_S or is_static(samples, positions, headings, seconds):
+        if np.median(steps) > _MAX_JUMP_M_S or is_static(samples, path, seconds):
             return None
-        confidence = self._confidence(samples, positions, headings, seconds)
+        confidence = self._confidence(samples, path)
         if confidence < _LEAST_CONFIDENCE:
             return None
         parts = [
@@ -468,37 +433,27 @@ class _ActorChain:
         samples = [segment.points for segment in segments]
         if path is None or length_of(samples) < _LONG_M or np.ptp(path[2]) < _BENDS_RAD:
             return actor, []
-        along = [points[:, 0] for points in _in_body(samples, path)]
+        along = [points[:, 0] for points in in_body(samples, path[0], path[2])]
         middle = np.quantile(np.concatenate(along), (_END, 1 - _END)).mean()
         rear = [own < middle for own in along]
         halves = [points[own] for points, own in zip(samples, rear, strict=True)]
-        seconds = np.array([link.seconds for link in self.links])
-        behind = estimate_path(halves, seconds, rigid=True)
-        across = [points[:, 1] for points in _in_body(samples, behind)]
+        behind = estimate_path(halves, self.seconds, rigid=True)
+        across = [points[:, 1] for points in in_body(samples, behind[0], behind[2])]
         shown = np.concatenate([y[own] for y, own in zip(across, rear, strict=True)])
         low, high = np.quantile(shown, (_END, 1 - _END))
         beside = [(y < low - _ASIDE_M) | (y > high + _ASIDE_M) for y in across]
-        both = list(zip(segments, self.links, beside, strict=True))
-        parts = [link.part(own) for _, link, own in both if own.sum() >= _MIN_PART]
+        parts = [
+            link.part(own)
+            for link, own in zip(self.links, beside, strict=True)
+            if own.sum() >= _MIN_PART
+        ]
         if len(parts) < _MIN_OBSERVATIONS:
             return actor, []
-        ahead = _ActorChain(parts[0])
-        ahead.links = parts
-        ahead.numbers = self.numbers
-        left = list[Segment]()
-        for segment, link, own in both:
-            kept = ~own | own.all()
-            members = link.part(kept).segment.members
-            left.append(replace(segment, members=members, points=segment.points[kept]))
+        left = [s.part(~own | own.all()) for s, own in zip(segments, beside, strict=True)]
+        ahead = _ActorChain(parts, self.numbers)
         return actor._replace(segments=left, path=behind), [ahead]
 
-    def _confidence(
-        self,
-        samples: list[FloatArray],
-        positions: FloatArray,
-        headings: FloatArray,
-        seconds: FloatArray,
-    ) -> float:
+    def _confidence(self, samples: list[FloatArray], path: Path) -> float:
         """Return the probability that the actor is real, from 0 to 1; the arguments are those of
         `misalignment`.
 
@@ -509,9 +464,8 @@ class _ActorChain:
         The second and the third term reject pieces of rails, fences and hedges: these have static
         neighbours, and align as well after any shift.
         """
-        _, best, *shifted = misalignment(
-            samples, positions, headings, seconds, (0.0, -_SHIFT_M, _SHIFT_M)
-        )
+        shifts = (0.0, -_SHIFT_M, _SHIFT_M)
+        _, best, *shifted = misalignment(samples, path, self.seconds, shifts)
         counts = np.array(
             [(len(link.segment.members), link.freed, link.around) for link in self.links]
         )
@@ -547,10 +501,8 @@ class _ActorChain:
         `ground_m` is the height of the ground, metres, sensor frame; NaN if it is unknown.
         """
         local = self._local()
-        lower, upper = (
-            np.median([bound(points, axis=0) for points in local], axis=0)
-            for bound in (np.min, np.max)
-        )
+        bounds = [(points.min(axis=0), points.max(axis=0)) for points in local]
+        lower, upper = np.median(bounds, axis=0)
         length, width, high = upper - lower
         if (
             lower[2] - ground_m < _FOOT_M
@@ -559,8 +511,7 @@ class _ActorChain:
         ):
             return True
         poses = np.stack([link.world_T_sensor for link in self.links])
-        seconds = np.array([link.seconds for link in self.links])
-        speed = np.gradient(poses[:, :3, 3], seconds, axis=0)
+        speed = np.gradient(poses[:, :3, 3], self.seconds, axis=0)
         speed = multiply(invert(poses)[:, :3, :3], speed[..., None])[:, :2, 0]
         middles, change = middles_of(local)[:, :2], speed - speed.mean(axis=0)
         delay = (middles * change).sum() / max(np.square(change).sum(), 1e-3)
@@ -587,18 +538,15 @@ class _ActorChain:
         return bool(stays and driven > _SENSOR_PATH_M and np.ptp(slopes) < _LINE_SLOPE)
 
 
-def _in_body(samples: list[FloatArray], path: Path) -> list[FloatArray]:
-    """Return the (M, 3) points of each observation of an actor, metres, actor frame."""
-    return [
-        multiply(points - place, rotation_z(heading)[:3, :3])
-        for points, place, heading in zip(samples, path[0], path[2], strict=True)
-    ]
-
-
 def _widened(cells: BoolArray) -> BoolArray:
     """Return the cells of a cube, and those beside them."""
     blocks = np.lib.stride_tricks.sliding_window_view(np.pad(cells, 1), (3, 3, 3))
     return np.asarray(blocks.any(axis=(3, 4, 5)))
+
+
+def _bounds(links: list[_Link]) -> FloatArray:
+    """Return the lower and the upper corners of observations: (2, L, 3)."""
+    return np.array([(link.lower, link.upper) for link in links]).reshape(-1, 2, 3).swapaxes(0, 1)
 
 
 def _is_small(size: FloatArray) -> bool:
@@ -638,9 +586,7 @@ def _join_parts(links: list[_Link], deformable: Collection[int]) -> list[_Link]:
     Rays that meet a side at a grazing angle are far apart, and split it.
     """
     joined, i = list(links), 0
-    lower, upper = (
-        np.array([getattr(link, name) for link in links]) for name in ("lower", "upper")
-    )
+    lower, upper = _bounds(links)
     while i < len(joined):
         gaps = np.maximum(lower[i] - upper[i + 1 :], lower[i + 1 :] - upper[i])
         near = np.flatnonzero((gaps <= _BONNET_M).all(axis=1)) + i + 1
@@ -693,15 +639,15 @@ def _link(
     """Continue chains with the clusters of a scan, best pairs first; join further parts to them;
     start new chains with the rest.
     """
-    clusters = [_Link.of(evidence, index) for index in range(len(evidence.clusters))]
-    apart = [part.thinned(_KEPT) for part in _split(clusters, alive)]
+    clusters = [_Link.of(evidence, cluster) for cluster in evidence.clusters]
+    # bounds stay those of all points
+    apart = [replace(p, segment=p.segment.thinned(_KEPT)) for p in _split(clusters, alive)]
     links = _join_parts(apart, deformable)
     taken = best_pairs(_costs(links, alive) if alive and links else [])
     main = sorted(taken, key=taken.__getitem__)
     # where the chains are expected
     moved = np.array([alive[taken[k]].shift(evidence.seconds) for k in main]).reshape(-1, 3)
-    ends = np.array([(alive[taken[k]].last.lower, alive[taken[k]].last.upper) for k in main])
-    lower, upper = ends.reshape(-1, 2, 3).swapaxes(0, 1) + moved
+    lower, upper = _bounds([alive[taken[k]].last for k in main]) + moved
     extra = dict[int, int]()
     for i, link in enumerate(links):
         if i not in taken and not _is_rider(link, deformable):
@@ -711,10 +657,10 @@ def _link(
                     extra[i] = main[row]
     for i, k in extra.items():
         links[k] = links[k].joined(links[i])
-    fresh = [_ActorChain(link) for i, link in enumerate(links) if i not in taken and i not in extra]
     for i, j in taken.items():
         alive[j].append(links[i])
-    alive.extend(fresh)
+    rest = [link for i, link in enumerate(links) if i not in taken and i not in extra]
+    alive += [_ActorChain([link], set()) for link in rest]
 
 
 def _costs(links: list[_Link], alive: list[_ActorChain]) -> list[tuple[float, int, int]]:
@@ -724,17 +670,13 @@ def _costs(links: list[_Link], alive: list[_ActorChain]) -> list[tuple[float, in
     ends = [chain.last for chain in alive]
     label = np.array([end.label for end in ends])
     seconds = np.array([end.seconds for end in ends])
-    lower, upper = (np.stack([getattr(end, name) for end in ends]) for name in ("lower", "upper"))
+    lower, upper = _bounds(ends)
     middle, size = (lower + upper) / 2, upper - lower
-    fresh = np.array([chain.velocity is None for chain in alive])
-    velocity = np.stack(
-        [np.zeros(3) if chain.velocity is None else chain.velocity for chain in alive]
-    )
+    fresh = np.array([len(chain.links) == 1 for chain in alive])
+    velocity = np.stack([chain.velocity for chain in alive])
     # (L, A, 3): of each observation and each chain
-    low, high, at = (
-        np.stack([getattr(link, name) for link in links])[:, None]
-        for name in ("lower", "upper", "middle")
-    )
+    low, high = _bounds(links)[:, :, None]
+    at = (low + high) / 2
     elapsed = links[0].seconds - seconds
     shift = velocity * elapsed[:, None]
     gap = np.maximum(np.maximum(lower + shift - high, low - upper - shift), 0.0)

@@ -59,15 +59,12 @@ def ground_points(points: AnyFloatArray) -> BoolArray:
     """
     own = np.ascontiguousarray(points[:, :3], np.float32)
     known = finite(own)
-    if not known.all():
-        ground = np.zeros(len(own), np.bool_)
-        ground[known] = ground_points(own[known])
-        return ground
+    ground, own = np.zeros(len(own), np.bool_), own[known]
     sector, ring, lowest = _lowest(own)
     plane = _plane(own, lowest)
-    if plane is None:
-        return np.zeros(len(own), np.bool_)
-    return _ground(own, sector, ring, lowest, plane)
+    if plane is not None:
+        ground[known] = _ground(own, sector, ring, lowest, plane)
+    return ground
 
 
 def ground_height(points: AnyFloatArray) -> float:
@@ -143,11 +140,7 @@ def _plane(
     x, y, z = np.moveaxis(chosen[samples[:, 1:]] - chosen[samples[:, :1]], 2, 0)
     area = x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]  # twice the area of the triangle, square metres
     wide = np.abs(area) > 1.0
-    x = x[wide]
-    y = y[wide]
-    z = z[wide]
-    area = area[wide]
-    corner = chosen[samples[wide, 0]]
+    x, y, z, area, corner = (own[wide] for own in (x, y, z, area, chosen[samples[:, 0]]))
     along_x = (z[:, 0] * y[:, 1] - z[:, 1] * y[:, 0]) / area
     along_y = (x[:, 0] * z[:, 1] - x[:, 1] * z[:, 0]) / area
     planes = np.column_stack(

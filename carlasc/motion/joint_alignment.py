@@ -25,7 +25,9 @@ import numpy as np
 from carlasc.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from carlasc.core.cells import run_starts
 from carlasc.core.compiling import cached, jit
-from carlasc.motion.solving import principal_axes, solve_positive
+from carlasc.core.geometry import thin
+from carlasc.motion.planes import SQUARES, SUMS
+from carlasc.motion.solving import principal_axes, solve_positive, squares_of
 
 HALF_BLOCK = 30
 """Half of the number of scans in a block.
@@ -42,8 +44,6 @@ _OUTLIER = 9.0
 _DETERMINED = 0.003  # least share of the planes, by weight, that determine a direction
 _STEEP, _SLANTED = 0.8, 0.3  # |z| of the normals of ground, and of slopes
 _PER_DIRECTION = 300  # greatest number of planes per direction: more add little
-_SUMS = 10  # 1, x, y, z, xx, xy, xz, yy, yz, zz
-_SQUARES = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])
 # Standard deviations of the prior, metres and radians: of a pose about the given pose, and of the
 # change of a pose about the change of the previous one; as weights.
 _PRIOR = np.array([2.0, math.radians(4.0), 0.1, math.radians(0.5)]) ** -2.0
@@ -158,18 +158,14 @@ def _choose(normals: FloatArray, thickness: FloatArray) -> IntArray:
     over the scene.
     """
     rows = np.flatnonzero(thickness >= 0)
-    x = normals[rows, 0]
-    y = normals[rows, 1]
-    upright = np.abs(normals[rows, 2])
+    x, y, z = normals[rows].T
+    upright = np.abs(z)
     # Four quarters of the compass for walls, by which axis is greater and by the sign of x y: a
     # normal and its opposite are in the same quarter. Without limits, ground would outvote walls.
     wall = 2 + 2 * (np.abs(x) > np.abs(y)) + (x * y > 0)
     direction = np.where(upright > _STEEP, 0, np.where(upright > _SLANTED, 1, wall))
-    chosen = [rows[:0]]
-    for number in range(6):
-        own = rows[direction == number]
-        chosen.append(own[:: max(1, -(-len(own) // _PER_DIRECTION))])
-    return np.concatenate(chosen)
+    alike = (rows[direction == number] for number in range(6))
+    return np.concatenate([thin(own, _PER_DIRECTION) for own in alike])
 
 
 def _determined(normals: FloatArray, thickness: FloatArray, chosen: IntArray) -> FloatArray:
@@ -178,8 +174,7 @@ def _determined(normals: FloatArray, thickness: FloatArray, chosen: IntArray) ->
     weights = 1.0 / (POINT_M**2 + thickness[chosen])
     # The eigenvectors of the sum of all normals' squares are the directions in which planes hold
     # the poses. Where the sum is small, noise would move the poses: the prior holds them there.
-    spread = (weights[:, None, None] * own[:, :, None] * own[:, None, :]).sum(axis=0)
-    values, vectors = principal_axes(spread[None])
+    values, vectors = principal_axes(squares_of(own, weights)[None])
     slopes = normals.copy()
     for value, vector in zip(values[0], vectors[0].T, strict=True):
         if value < _DETERMINED * values.sum():
@@ -208,7 +203,7 @@ def clusters(
         size *= 2
     table = np.full(size, -1, np.int64)
     keys = np.empty(len(points), np.int64)
-    sums = np.zeros((len(points), _SUMS))
+    sums = np.zeros((len(points), SUMS))
     count = 0
     seen, at = np.empty(3), np.empty(3)
     for i in range(len(points)):
@@ -251,7 +246,7 @@ def spread_of(block: Clusters, poses: FloatArray, scans: int) -> tuple[BoolArray
     start, scan, sums = block
     cells = len(start) - 1
     enough, covariances = np.zeros(cells, np.bool_), np.zeros((cells, 3, 3))
-    total, to, center = np.empty(_SUMS), np.empty(3), np.empty(3)
+    total, to, center = np.empty(SUMS), np.empty(3), np.empty(3)
     for g in range(cells):
         first = start[g]
         if start[g + 1] - first < scans:
@@ -269,7 +264,7 @@ def spread_of(block: Clusters, poses: FloatArray, scans: int) -> tuple[BoolArray
             for a in range(3):
                 total[1 + a] += weight * (sums[r, 1 + a] + sums[r, 0] * to[a])
                 for b in range(a, 3):
-                    k = _SQUARES[a, b]
+                    k = SQUARES[a, b]
                     # The sums of squares about the new centre, by the theorem of parallel axes:
                     # clusters are summed once per step, and the points are not read again.
                     moved = (
@@ -283,7 +278,7 @@ def spread_of(block: Clusters, poses: FloatArray, scans: int) -> tuple[BoolArray
         for a in range(3):
             for b in range(3):
                 mean = total[1 + a] * total[1 + b] / (total[0] * total[0])
-                covariances[g, a, b] = total[_SQUARES[a, b]] / total[0] - mean
+                covariances[g, a, b] = total[SQUARES[a, b]] / total[0] - mean
     return enough, covariances
 
 
@@ -303,7 +298,6 @@ def to_plane(
         off[i] = 0.0
         for a in range(3):
             off[i] += normal[a] * (sums[i, 1 + a] / sums[i, 0] + poses[scan[i], a, 3])
-        weight[i] = min(sums[i, 0], _EQUAL) / variance
     # The position of a plane is the weighted mean of its clusters, so it is eliminated: distances
     # are relative to it. Weights and mean depend on each other, and settle within four rounds.
     for repeat in range(4):

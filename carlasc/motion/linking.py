@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import replace
-from itertools import islice
+from functools import reduce
+from itertools import compress, islice
 
 import numpy as np
 
@@ -93,13 +93,11 @@ class Linker:
 
     def _end(self, seconds: float) -> list[Chain]:
         """Remove and return the chains whose actors were not seen for the maximum gap."""
-        since = {frame: seconds - then for frame, then in self._seconds.items()}
-        over = [chain for chain in self._chains if since[chain[-1].frame] > _MAX_GAP_S]
-        over += [chain for chain in self._numbered if since[chain[-1].frame] > _NUMBERED_GAP_S]
-        self._chains = [chain for chain in self._chains if since[chain[-1].frame] <= _MAX_GAP_S]
-        self._numbered = [
-            chain for chain in self._numbered if since[chain[-1].frame] <= _NUMBERED_GAP_S
-        ]
+        over: list[Chain] = []
+        for chains, gap_s in ((self._chains, _MAX_GAP_S), (self._numbered, _NUMBERED_GAP_S)):
+            late = [seconds - self._seconds[chain[-1].frame] > gap_s for chain in chains]
+            over += compress(chains, late)
+            chains[:] = [chain for chain, is_late in zip(chains, late, strict=True) if not is_late]
         kept_s = _NUMBERED_GAP_S + _MAX_GAP_S
         self._seconds = {
             frame: then for frame, then in self._seconds.items() if seconds - then <= kept_s
@@ -119,7 +117,7 @@ class Linker:
         for j, chain in enumerate(self._numbered):
             parts = [segments[i] for i, continued in linked.items() if continued == j]
             if parts:
-                chain.append(_together(parts))
+                chain.append(reduce(Segment.joined, parts))
         self._numbered += [[segment] for i, segment in enumerate(segments) if i not in linked]
 
     def _candidates(self, segments: list[Segment], seconds: float) -> list[tuple[int, int, bool]]:
@@ -235,13 +233,3 @@ def _gaps(segments: list[Segment], ends: list[Segment], shifts: FloatArray) -> F
         np.stack([bound(s.points, axis=0) for s in ends]) + shifts for bound in (np.min, np.max)
     )
     return _lengths(np.maximum(np.maximum(lowest - upper, lower - highest), 0.0))
-
-
-def _together(parts: list[Segment]) -> Segment:
-    """Join several segments of one actor in one scan; label, number and velocity are those of the
-    first.
-    """
-    members = np.concatenate([part.members for part in parts])
-    return replace(
-        parts[0], members=members, points=np.concatenate([part.points for part in parts])
-    )

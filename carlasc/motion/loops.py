@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from carlasc.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from carlasc.core.cells import distinct
+from carlasc.core.cells import cells_of, distinct
 from carlasc.core.geometry import (
     Transform,
     invert,
@@ -31,7 +31,7 @@ from carlasc.core.geometry import (
 )
 from carlasc.motion.joint_alignment import clusters, move
 from carlasc.motion.planes import covariances
-from carlasc.motion.solving import principal_axes, solve_positive
+from carlasc.motion.solving import principal_axes, solve_positive, squares_of
 
 _STEP_M, _SUBMAP_M, _REACH_M = 1.0, 10.0, 30.0  # between used scans; length; of points, sideways
 # Of a plane: see `SubmapPlanes`.
@@ -81,13 +81,17 @@ class SubmapPlanes(NamedTuple):
             values[:, 1] > _WIDE_M2
         )
         centres = sums[flat, 1:4] / sums[flat, :1]
-        keys = _keys(np.floor(centres / _CELL_M).astype(np.int64))
+        keys = _keys(cells_of(centres, _CELL_M))
         order = np.argsort(keys)
         return cls(keys[order], centres[order], vectors[flat, :, 0][order])
 
     def moved(self, pose: Transform) -> tuple[FloatArray, FloatArray]:
         """Return the centres and the normals in another frame."""
         return transform_points(pose, self.centres), rotate_vectors(pose, self.normals)
+
+
+Pairs = tuple[IntArray, IntArray]
+"""(M,) rows of planes of one submap, and (M,) rows of planes of another one that lie on them."""
 
 
 class Submap(NamedTuple):
@@ -158,9 +162,8 @@ class Submaps:
         used = _near([(one, pose) for _, _, pose, one, _ in self._scans], origin)
         held = _near([(one, pose) for _, _, pose, _, one in self._scans], origin)
         planes = SubmapPlanes.of(used)
-        above = (np.abs(planes.normals[:, 2]) > _LEVEL) & (planes.centres[:, 2] > 0.3)
-        ground = (np.abs(planes.normals[:, 2]) > _LEVEL) & (planes.centres[:, 2] < -0.3)
-        covered = bool(above.sum() > 0.3 * ground.sum())
+        heights = planes.centres[np.abs(planes.normals[:, 2]) > _LEVEL, 2]
+        covered = bool((heights > 0.3).sum() > 0.3 * (heights < -0.3).sum())
         self.done.append(
             Submap(row, along_m, origin, planes, SubmapPlanes.of(held), _upright(used), covered)
         )
@@ -180,7 +183,7 @@ def _keys(cells: IntArray) -> IntArray:
 
 def _upright(points: Float32Array) -> IntArray:
     """Return the (K, 2) pixels in which (N, 3) points are at several levels."""
-    levels, _ = distinct(_keys(np.floor(points / np.float32(_PIXEL_M)).astype(np.int64)))
+    levels, _ = distinct(_keys(cells_of(points, _PIXEL_M)))
     columns, number = distinct(levels >> 11)
     tall = columns[np.bincount(number) >= _LEVELS]
     return np.stack([tall >> 11, tall & 2047], axis=1) - 1024
@@ -198,7 +201,8 @@ def close_loops(submaps: Sequence[Submap], poses: FloatArray) -> tuple[FloatArra
         two scans, and the distance of the planes of the two passes before and after, metres, where
         the points took no part.
     """
-    loops = _agreeing(submaps, [loop for pair in _pairs(submaps) for loop in _lay(submaps, *pair)])
+    found = [loop for pair in _pairs(submaps) for loop in _lay(submaps, *pair)]
+    loops = _agreeing(submaps, found) if found else []
     if not loops:
         return poses, np.empty((0, 4))
     loops = loops[:: -(-len(loops) // _UNKNOWNS)]
@@ -212,19 +216,18 @@ def close_loops(submaps: Sequence[Submap], poses: FloatArray) -> tuple[FloatArra
     loops, solved = _solve(start, np.diff(chosen), loops)
     at = np.clip(np.arange(len(poses), dtype=np.float64), rows[0], rows[-1])
     moved = multiply(slerp(solved, rows, at), invert(slerp(start, rows, at)), poses)
-    found = []
+    distances = []
     for first, second, *_ in loops:
         one, other = chosen[first], chosen[second]
-        now = multiply(invert(solved[first]), solved[second])
-        was = multiply(invert(start[first]), start[second])
+        was, now = (multiply(invert(way[first]), way[second]) for way in (start, solved))
         pairs = _matches(submaps[one].held, submaps[other].held, now, _SAME_M)
         if len(pairs[0]):
             apart = [
-                _apart(submaps[one].held, submaps[other].held, motion, *pairs)
+                _apart(submaps[one].held, submaps[other].held, motion, pairs)
                 for motion in (was, now)
             ]
-            found.append([rows[first], rows[second], *apart])
-    return moved, np.array(found).reshape(-1, 4)
+            distances.append([rows[first], rows[second], *apart])
+    return moved, np.array(distances).reshape(-1, 4)
 
 
 def _window(gap_m: float, covered: bool) -> tuple[float, float]:
@@ -262,33 +265,31 @@ def _lay(submaps: Sequence[Submap], first: int, second: int) -> Iterator[Loop]:
     gap = other.along_m - one.along_m
     window, height = _window(gap, one.covered or other.covered)
     given = translation(other.origin - one.origin)
-    fits: list[tuple[float, Transform]] = []
+    fits: list[tuple[float, Transform, Pairs]] = []
     for start in _positions(one, other, given, window, min(_TURN_RAD + _TURN * gap, _MOST_RAD)):
         start[2, 3] += _rise(one.planes, other.planes, start, height)
         motion = _register(one.planes, other.planes, start)
-        fits.append((_common(one.planes, other.planes, motion), motion))
+        pairs = _matches(one.planes, other.planes, motion, _SAME_M)
+        fits.append((_common(one.planes, other.planes, motion, pairs), motion, pairs))
     if not fits:
         return
-    best, motion = max(fits, key=lambda fit: fit[0])
+    best, motion, pairs = max(fits, key=lambda fit: fit[0])
     off = motion[:3, 3] - given[:3, 3]
-    spread = _spread(one.planes, other.planes, motion)
-    values, axes = principal_axes(spread[None])
+    values, axes = principal_axes(_spread(one.planes, pairs)[None])
     weakest = axes[0, :, 0]
     rivals = [
-        where
-        for common, where in fits
+        theirs
+        for common, where, theirs in fits
         if np.square(where[:3, 3] - motion[:3, 3]).sum() > _OTHER_M**2
         and common > _AMBIGUOUS * best
     ]
     # along a street, all positions have its walls in common: what stands across it decides
     alone = best > _SHARE and all(
-        weakest @ _spread(one.planes, other.planes, rival) @ weakest < _LOOSE * values[0, 0]
-        for rival in rivals
+        weakest @ _spread(one.planes, rival) @ weakest < _LOOSE * values[0, 0] for rival in rivals
     )
     possible = np.hypot(off[0], off[1]) < window and abs(off[2]) < height
     held = values[0, 0] > _DETERMINED * values.sum()
-    near = _matches(one.planes, other.planes, motion, _SAME_M)
-    if alone and possible and held and _apart(one.planes, other.planes, motion, *near) < _ROUGH_M:
+    if alone and possible and held and _apart(one.planes, other.planes, motion, pairs) < _ROUGH_M:
         yield Loop(first, second, motion, float(values[0, 0]))
 
 
@@ -305,10 +306,8 @@ def _positions(
     middles = np.column_stack([(other.pixels + 0.5) * _PIXEL_M, np.zeros(len(other.pixels))])
     for image, yaw in zip(images[1:], yaws.tolist(), strict=True):
         turned = transform_points(rotation_z(yaw), middles)[:, :2]
-        image[tuple(np.floor(turned / _PIXEL_M).astype(np.int64).T + _PIXELS // 2)] = 1.0
-    waves = np.fft.rfft2(images)
-    overlap = np.fft.irfft2(waves[0] * waves[1:].conj(), s=images.shape[1:]).round()
-    shifts = np.fft.fftfreq(_PIXELS, 1.0 / _PIXELS) * _PIXEL_M
+        image[tuple(cells_of(turned, _PIXEL_M).T + _PIXELS // 2)] = 1.0
+    overlap, shifts = overlaps(images[:1], images[1:], _PIXEL_M)
     x, y = shifts[:, None] - given[0, 3], shifts - given[1, 3]
     best, which = overlap.max(axis=0), overlap.argmax(axis=0)
     best[np.hypot(x, y) > 2 * window + _MARGIN_M] = 0.0
@@ -323,13 +322,25 @@ def _positions(
         best[np.hypot(shifts[:, None] - shifts[row], shifts - shifts[column]) < _PEAK_M] = 0.0
 
 
+def overlaps(
+    images: FloatArray, others: FloatArray, pixel_m: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return (N, P, P) how many pixels (N, P, P) images of zeros and ones share with the others, if
+    these are shifted in circles along both axes, and the (P,) shifts along an axis, metres.
+    """
+    count = images.shape[-1]
+    waves = np.fft.rfft2(images) * np.fft.rfft2(others).conj()
+    shared = np.fft.irfft2(waves, s=(count, count)).round()
+    return shared, np.fft.fftfreq(count, 1.0 / count) * pixel_m
+
+
 def _rise(one: SubmapPlanes, other: SubmapPlanes, motion: Transform, most: float) -> float:
     """Return how much higher the ground of the first submap lies than that of the second one."""
     lowest = []
     for centres, normals in (one.moved(np.eye(4)), other.moved(motion)):
         level = centres[np.abs(normals[:, 2]) > _LEVEL]
         level = level[np.argsort(level[:, 2], kind="stable")]
-        cells = np.floor(level[:, :2] / _CELL_M).astype(np.int64) + 1024
+        cells = cells_of(level[:, :2], _CELL_M) + 1024
         keys, rows = np.unique((cells[:, 0] << 11) | cells[:, 1], return_index=True)
         lowest.append((keys, level[rows, 2]))
     (keys, heights), (others, lower) = lowest
@@ -338,14 +349,10 @@ def _rise(one: SubmapPlanes, other: SubmapPlanes, motion: Transform, most: float
     return rise if abs(rise) < most else 0.0
 
 
-def _matches(
-    one: SubmapPlanes, other: SubmapPlanes, motion: Transform, gate_m: float
-) -> tuple[IntArray, IntArray]:
-    """Return the (M,) rows of planes of the first submap, and of the planes of the second one that
-    lie on them.
-    """
+def _matches(one: SubmapPlanes, other: SubmapPlanes, motion: Transform, gate_m: float) -> Pairs:
+    """Return the planes of the first submap on which planes of the second one lie, and these."""
     centres, normals = other.moved(motion)
-    cells = np.floor(centres / _CELL_M).astype(np.int64)
+    cells = cells_of(centres, _CELL_M)
     nearest, squared = np.full(len(centres), -1), np.full(len(centres), np.inf)
     if not len(one.keys):
         return nearest[:0], nearest[:0]
@@ -363,10 +370,9 @@ def _matches(
     return nearest[rows], rows
 
 
-def _apart(
-    one: SubmapPlanes, other: SubmapPlanes, motion: Transform, a: IntArray, b: IntArray
-) -> float:
+def _apart(one: SubmapPlanes, other: SubmapPlanes, motion: Transform, pairs: Pairs) -> float:
     """Return the root mean square distance of pairs of planes."""
+    a, b = pairs
     centres, _ = other.moved(motion)
     off = ((centres[b] - one.centres[a]) * one.normals[a]).sum(axis=1)
     return float(np.sqrt(np.square(off).mean()))
@@ -385,27 +391,29 @@ def _register(one: SubmapPlanes, other: SubmapPlanes, start: Transform) -> Trans
         off = ((centres[b] - one.centres[a]) * normals).sum(axis=1)
         slopes = np.concatenate([normals, np.cross(arms, normals)], axis=1)
         weights = (1.0 + np.square(off / (0.3 * gate))) ** -2.0
-        matrix = np.diag([1.0] * 3 + [100.0] * 3)
-        matrix += (weights[:, None, None] * slopes[:, :, None] * slopes[:, None, :]).sum(axis=0)
+        matrix = np.diag([1.0] * 3 + [100.0] * 3) + squares_of(slopes, weights)
         right = -(weights * off)[:, None] * slopes
         move(poses, solve_positive(matrix, right.sum(axis=0))[None], 0)
     return np.asarray(poses[0])
 
 
-def _inside(centres: FloatArray, origin: FloatArray) -> BoolArray:
-    return np.hypot(centres[:, 0] - origin[0], centres[:, 1] - origin[1]) < _INSIDE_M
+def _inside(centres: FloatArray, motion: Transform) -> BoolArray:
+    """Return which of (P, 3) centres, frame of the first submap, are near both origins."""
+    x, y, _ = centres.T
+    away = np.maximum(np.hypot(x, y), np.hypot(x - motion[0, 3], y - motion[1, 3]))
+    return away < _INSIDE_M
 
 
-def _common(one: SubmapPlanes, other: SubmapPlanes, motion: Transform) -> float:
+def _common(one: SubmapPlanes, other: SubmapPlanes, motion: Transform, pairs: Pairs) -> float:
     """Return the least share of planes of a submap that the other one has too, of walls and of
     all.
     """
-    a, b = _matches(one, other, motion, _SAME_M)
+    a, b = pairs
     centres, _ = other.moved(motion)
     shares = []
     for planes, rows, near in (
-        (one, a, _inside(one.centres, motion[:3, 3]) & _inside(one.centres, np.zeros(3))),
-        (other, b, _inside(centres, np.zeros(3)) & _inside(centres, motion[:3, 3])),
+        (one, a, _inside(one.centres, motion)),
+        (other, b, _inside(centres, motion)),
     ):
         common = np.zeros(len(near), np.bool_)
         common[rows] = True
@@ -414,10 +422,10 @@ def _common(one: SubmapPlanes, other: SubmapPlanes, motion: Transform) -> float:
     return min(shares)
 
 
-def _spread(one: SubmapPlanes, other: SubmapPlanes, motion: Transform) -> FloatArray:
+def _spread(one: SubmapPlanes, pairs: Pairs) -> FloatArray:
     """Return how many of the common planes of two submaps lie across each direction: (3, 3)."""
-    normals = one.normals[_matches(one, other, motion, _SAME_M)[0]]
-    return np.asarray((normals[:, :, None] * normals[:, None, :]).sum(axis=0))
+    normals = one.normals[pairs[0]]
+    return squares_of(normals, np.ones(len(normals)))
 
 
 def _agreeing(submaps: Sequence[Submap], loops: list[Loop]) -> list[Loop]:
@@ -425,25 +433,19 @@ def _agreeing(submaps: Sequence[Submap], loops: list[Loop]) -> list[Loop]:
     have enough planes across every direction.
     """
     chosen = []
-    offs = [
-        small_motions(loop.motion[None])[0]
-        - np.append(submaps[loop.second].origin - submaps[loop.first].origin, np.zeros(3))
-        for loop in loops
-    ]
-    for loop, off in zip(loops, offs, strict=True):
-        near, agreeing = 0, list[float]()
-        for other, theirs in zip(loops, offs, strict=True):
-            apart = sum(
-                abs(submaps[x].along_m - submaps[y].along_m)
-                for x, y in ((loop.first, other.first), (loop.second, other.second))
-            )
-            if other is not loop and apart < _TOGETHER_M:
-                away = float(np.sqrt(np.square(off[:3] - theirs[:3]).sum()))
-                turned = float(np.abs(off[3:] - theirs[3:]).max())
-                near += 1
-                if away < _AGREE_M + _DRIFT * apart and turned < _AGREE_RAD:
-                    agreeing.append(other.held)
-        if 2 * len(agreeing) > near and loop.held + sum(agreeing) > _FEWEST:
+    ends = [(submaps[loop.first], submaps[loop.second]) for loop in loops]
+    along = np.array([(one.along_m, other.along_m) for one, other in ends])
+    held = np.array([loop.held for loop in loops])
+    offs = np.array([small_motions(loop.motion[None])[0] for loop in loops])
+    offs[:, :3] -= np.array([other.origin - one.origin for one, other in ends])
+    for row, loop in enumerate(loops):
+        apart = np.abs(along - along[row]).sum(axis=1)
+        near = apart < _TOGETHER_M
+        near[row] = False
+        away = np.linalg.norm(offs[:, :3] - offs[row, :3], axis=1)
+        turned = np.abs(offs[:, 3:] - offs[row, 3:]).max(axis=1)
+        agree = near & (away < _AGREE_M + _DRIFT * apart) & (turned < _AGREE_RAD)
+        if 2 * agree.sum() > near.sum() and loop.held + held[agree].sum() > _FEWEST:
             chosen.append(loop)
     return chosen
 
@@ -501,12 +503,10 @@ def _add(
         small_motions(multiply(poses[j], invert(should))[None])[0, 3:],
     )
     x, y, z = should[:3, 3] - poses[i, :3, 3]
-    slope = np.zeros((6, 12))  # of `off` by the steps of the two poses: see `move`
-    slope[:, 6:], slope[:, :6] = np.eye(6), -np.eye(6)
+    # of `off` by the steps of the two poses: see `move`
+    slope = np.hstack([-np.eye(6), np.eye(6)])
     slope[:3, 3:6] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
     weights = error**-2.0
     rows = np.append(np.arange(6 * i, 6 * i + 6), np.arange(6 * j, 6 * j + 6))
-    matrix[np.ix_(rows, rows)] += (
-        weights[:, None, None] * slope[:, :, None] * slope[:, None, :]
-    ).sum(axis=0)
+    matrix[np.ix_(rows, rows)] += squares_of(slope, weights)
     right[rows] -= ((weights * off)[:, None] * slope).sum(axis=0)

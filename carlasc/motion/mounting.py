@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from carlasc.core.arrays import BoolArray, FloatArray, IntArray
-from carlasc.core.geometry import Transform, invert, multiply, rotations_of, slerp, small_motions
-from carlasc.motion.solving import solve_positive
+from carlasc.core.geometry import Transform, invert, multiply, poses_from, slerp, small_motions
+from carlasc.motion.solving import solve_positive, squares_of
 
 _LAGS = (2, 5, 10, 20)  # scans between the start and the end of a compared motion
 _ROUNDS = 8
@@ -126,18 +126,16 @@ def find_mounting(
         )
         scaled, slope = off / scale, slope / scale[:, None]
         weights = 1.0 / (1.0 + np.square(scaled) / _ROBUST)
-        information = (weights[:, :, None, None] * slope[:, :, :, None] * slope[:, :, None, :]).sum(
-            axis=(0, 1)
-        )
+        information = squares_of(slope.reshape(-1, 7), weights.reshape(-1))
         # values that are not determined stay zero
         information += np.diag((10.0 * _DETERMINED) ** -2.0)
-        right = -(weights[:, :, None] * slope * scaled[:, :, None]).sum(axis=(0, 1))
-        step = solve_positive(information.copy(), right)
+        pulls = weights[:, :, None] * slope * scaled[:, :, None]
+        step = solve_positive(information.copy(), -pulls.sum(axis=(0, 1)))
         values = np.clip(values + step, -_LIMITS, _LIMITS)
     inverse = np.stack([solve_positive(information.copy(), row) for row in np.eye(7)])
     # Drift and distortion make errors that motions within some seconds share, so their sums vary
     # more than those of independent ones. Few sums need a wider interval (Student's t).
-    pulls = (weights[:, :, None] * slope * scaled[:, :, None]).sum(axis=1)
+    pulls = pulls.sum(axis=1)
     shared = np.concatenate([part.groups + 1j * row for row, part in enumerate(parts)])
     sums = np.stack([pulls[shared == group].sum(axis=0) for group in np.unique(shared)])
     more = max(len(sums) - 1, 1)
@@ -219,10 +217,8 @@ def _residuals(parts: Sequence[_Motions], values: FloatArray) -> FloatArray:
 
 def _transform(values: FloatArray) -> Transform:
     """Return the (4, 4) pose of the sensor from the first six values."""
-    mounted = np.eye(4)
     x, y, z = values[3:6]
     angle = float(np.sqrt(x * x + y * y + z * z))
     half = np.sin(angle / 2) / angle if angle > 1e-9 else 0.5
-    mounted[:3, :3] = rotations_of(np.array([[np.cos(angle / 2), half * x, half * y, half * z]]))[0]
-    mounted[:3, 3] = values[:3]
-    return mounted
+    turn = np.array([[np.cos(angle / 2), half * x, half * y, half * z]])
+    return np.asarray(poses_from(turn, values[None, :3])[0])

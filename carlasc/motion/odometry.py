@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from carlasc.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray, IntArray
-from carlasc.core.cells import distinct, first_of_cells
+from carlasc.core.cells import cells_of, distinct, first_of_cells
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import (
     Transform,
@@ -32,6 +32,7 @@ from carlasc.core.scans import finite, lengths
 from carlasc.errors import ArgumentError, import_extra
 from carlasc.motion.ground import ground_height, ground_points
 from carlasc.motion.joint_alignment import AlignmentPass, align
+from carlasc.motion.loops import overlaps
 from carlasc.running.spreading import Progress
 
 MIN_POINTS = 100  # scans with fewer points do not determine the motion
@@ -238,7 +239,7 @@ class _PlaneOdometry:
 
 def _thinned(points: Float32Array, voxel_m: float) -> Float32Array:
     """Return one of the (N, 3) points in each voxel."""
-    return points[first_of_cells(np.floor(points / np.float32(voxel_m)).astype(np.int64))]
+    return points[first_of_cells(cells_of(points, voxel_m))]
 
 
 def measure_drift(points: Callable[[int], AnyFloatArray], poses: FloatArray) -> tuple[float, bool]:
@@ -331,7 +332,7 @@ def _follow(
 
 def _cells_above(points: AnyFloatArray) -> IntArray:
     """Return the distinct cells (row, column), seen from above, of things above the sensor."""
-    cells = np.floor(points[points[:, 2] > _ABOVE_M, :2] / _CELL_M).astype(np.int64) + _CELLS // 2
+    cells = cells_of(points[points[:, 2] > _ABOVE_M, :2], _CELL_M) + _CELLS // 2
     inside = ((cells >= 0) & (cells < _CELLS)).all(axis=1)
     return np.unique(cells[inside], axis=0)
 
@@ -343,9 +344,8 @@ def _likely_shift(above: Sequence[IntArray], reach_m: float) -> FloatArray:
     images = np.zeros((len(above), _CELLS, _CELLS))
     for image, cells in zip(images, above, strict=True):
         image[tuple(cells.T)] = 1.0
-    waves = np.fft.rfft2(images)
-    overlap = np.fft.irfft2((waves[:-1] * waves[1:].conj()).sum(axis=0), s=images.shape[1:]).round()
-    shifts = np.fft.fftfreq(_CELLS, 1.0 / _CELLS) * _CELL_M
+    shared, shifts = overlaps(images[:-1], images[1:], _CELL_M)
+    overlap = shared.sum(axis=0)
     overlap[np.hypot(shifts[:, None], shifts) > reach_m] = -1.0
     x, y = np.unravel_index(np.argmax(overlap), overlap.shape)
     return np.array([shifts[x], shifts[y]])

@@ -21,7 +21,7 @@ from carlasc.core.arrays import (
     Int32Array,
     IntArray,
 )
-from carlasc.core.cells import as_pose, distinct, joined, numbered, run_starts
+from carlasc.core.cells import as_pose, cells_of, distinct, joined, numbered, run_starts
 from carlasc.core.geometry import (
     Transform,
     invert,
@@ -66,7 +66,7 @@ def other_passes(positions: FloatArray, seconds: FloatArray) -> dict[int, list[I
         seconds: (F,) times.
     """
     steps = np.sqrt(np.square(np.diff(positions, axis=0)).sum(axis=1))
-    along = np.concatenate([np.zeros(1), np.cumsum(steps)])
+    along = np.append(0.0, np.cumsum(steps))
     used = np.unique(np.floor(along / _STEP_M), return_index=True)[1]
     found = dict[int, list[IntArray]]()
     for row in used.tolist():
@@ -106,7 +106,7 @@ def compare_passes(
     rows = np.flatnonzero(compared & (np.hypot(points[:, 0], points[:, 1]) < _REACH_M))
     height = points[rows, 2] - points[rows, :2] @ plane[:2] - plane[2]
     rows, height = rows[height < _HIGH_M], height[height < _HIGH_M]
-    first, _ = numbered(np.floor(world[rows] / _CELL_M).astype(np.int64))
+    first, _ = numbered(cells_of(world[rows], _CELL_M))
     rows, low = rows[first], height[first] < _LOW_M
     asked = np.ascontiguousarray(points[rows], np.float32)
     freed, held = np.zeros((2, len(rows)), np.bool_)
@@ -183,7 +183,7 @@ def find_gone(keys: IntArray, counts: Int32Array) -> tuple[IntArray, int]:
 
 def keys_of(points: AnyFloatArray) -> IntArray:
     """Return the keys of the cells of (N, 3) points, metres, world."""
-    x, y, z = np.floor(points / _CELL_M).astype(np.int64).T
+    x, y, z = cells_of(points, _CELL_M).T
     return np.asarray(((x + (1 << 20)) << 41) | ((y + (1 << 20)) << 20) | (z + (1 << 19)))
 
 

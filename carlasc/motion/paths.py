@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from carlasc.core.arrays import AnyFloatArray, FloatArray, IntArray
+from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray, IntArray
 from carlasc.core.geometry import (
     invert,
     moved_back,
@@ -94,8 +94,7 @@ class Segment:
     @property
     def center(self) -> FloatArray:
         """(3,) centre of the points' bounding box, metres, world."""
-        center: FloatArray = (self.points.min(axis=0) + self.points.max(axis=0)) / 2
-        return center
+        return middles_of([self.points])[0]
 
     def thinned(self, most: int) -> Segment:
         """Return the same with at most `most` of the points; `members` stay complete."""
@@ -103,6 +102,24 @@ class Segment:
             return replace(self, points=thin(self.points, most))
         rows = spread_rows(len(self.points), most)
         return replace(self, points=self.points[rows], times=self.times[rows])
+
+    def part(self, chosen: BoolArray) -> Segment:
+        """Return the segment of some of the (M,) points; members that were thinned out are where
+        the points beside them in the scan are.
+        """
+        rows = spread_rows(len(self.members), len(self.points))
+        after = np.searchsorted(rows, np.arange(len(self.members)), side="right") - 1
+        members = self.members[chosen[np.maximum(after, 0)]]
+        times = None if self.times is None else self.times[chosen]
+        return replace(self, members=members, points=self.points[chosen], times=times)
+
+    def joined(self, other: Segment) -> Segment:
+        """Return this segment with the points of another one of the scan too."""
+        members = np.concatenate([self.members, other.members])
+        points = np.concatenate([self.points, other.points])
+        known = self.times is not None and other.times is not None
+        times = np.concatenate([self.times, other.times]) if known else None
+        return replace(self, members=members, points=points, times=times)
 
     def at_frame(self, velocity: FloatArray) -> Segment:
         """Return the same with its points moved to the time of the frame, by (3,) m/s, world."""
@@ -181,24 +198,28 @@ def estimate_path(
     )
 
 
-def is_static(
-    observations: Sequence[FloatArray],
-    positions: FloatArray,
-    headings: FloatArray,
-    seconds: FloatArray,
-) -> bool:
+def in_body(
+    observations: Sequence[FloatArray], positions: FloatArray, headings: FloatArray
+) -> list[FloatArray]:
+    """Return the (M, 3) points of each observation of an actor, metres, actor frame."""
+    return [
+        multiply(points - place, rotation_z(heading)[:3, :3])
+        for points, place, heading in zip(observations, positions, headings, strict=True)
+    ]
+
+
+def is_static(observations: Sequence[FloatArray], path: Path, seconds: FloatArray) -> bool:
     """Return whether observations align as well without motion as with the estimated motion; the
     arguments are those of `misalignment`.
     """
     # a wrong path aligns them badly too
-    still, moved = misalignment(observations, positions, headings, seconds)
+    still, moved = misalignment(observations, path, seconds)
     return bool(np.isnan(still) or still < min(moved + _DOUBT_M, _STATIC_M))
 
 
 def misalignment(
     observations: Sequence[FloatArray],
-    positions: FloatArray,
-    headings: FloatArray,
+    path: Path,
     seconds: FloatArray,
     shifts_m: Sequence[float] = (0.0,),
 ) -> tuple[float, ...]:
@@ -207,8 +228,7 @@ def misalignment(
 
     Args:
         observations: (M, 3) points of the actor at each time, metres, world.
-        positions: (F, 3) estimated positions of the actor, metres, world.
-        headings: (F,) estimated headings, radians.
+        path: the estimated motion.
         seconds: (F,) times, increasing.
         shifts_m: shifts along the heading that are added to the estimated motion, metres.
 
@@ -217,11 +237,7 @@ def misalignment(
         are NaN for a single observation.
     """
     thinned = [thin(points, _POINTS) for points in observations]
-    body = [
-        multiply(points - positions[i], rotation_z(headings[i])[:3, :3])
-        for i, points in enumerate(thinned)
-    ]
-    means = []
+    body, means = in_body(thinned, path[0], path[2]), []
     for i in np.unique(np.linspace(0, len(seconds) - 1, _PAIRS).astype(int)):
         j = int(np.argmin(np.abs(np.abs(seconds - seconds[i]) - _APART_S)))
         if j != i:

@@ -16,7 +16,7 @@ import math
 import numpy as np
 
 from carlasc.core.arrays import BoolArray, FloatArray, IntArray
-from carlasc.core.cells import first_of_cells
+from carlasc.core.cells import cells_of, first_of_cells
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, rotation_z, thin
 from carlasc.motion.solving import principal_axes, solve_positive
@@ -24,9 +24,9 @@ from carlasc.motion.solving import principal_axes, solve_positive
 _CELL_M, _POINTS = 0.15, 1200  # a model has one point per cell, and at most this number of points
 _PLANE_M = 0.5  # radius of the neighbourhood in which planes are estimated
 _LINE_M = 0.06  # points with a smaller standard deviation across are a line and have no plane
-_SUMS = 10  # 1, x, y, z, xx, xy, xz, yy, yz, zz
+SUMS = 10  # 1, x, y, z, xx, xy, xz, yy, yz, zz
 # positions of the last six in a (3, 3) matrix
-_SQUARES = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])
+SQUARES = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])
 
 
 class Planes:
@@ -36,6 +36,8 @@ class Planes:
         points: (M, 3) metres, actor frame.
         normals: (M, 3) normals of the planes. Their length, at most 1, grows with the flatness of
             the points. The normal of a single point or of a line has length 0.
+        in_order: (M, 3) points, sorted along the axis of their largest extent, the (M,) index of
+            each in `points`, and this axis; known after `add`.
     """
 
     def __init__(self) -> None:
@@ -43,40 +45,33 @@ class Planes:
         self.points, self.normals, self._sums = (
             np.empty((0, 3)),
             np.empty((0, 3)),
-            np.empty((0, _SUMS)),
+            np.empty((0, SUMS)),
         )
 
     def add(self, points: FloatArray) -> None:
         """Add the (N, 3) points, metres, actor frame, that are in cells without a point."""
         joined, known = np.concatenate([self.points, points]), len(self.points)
-        joined = joined[first_of_cells(np.floor(joined / _CELL_M).astype(np.int64))]
+        joined = joined[first_of_cells(cells_of(joined, _CELL_M))]
         if len(joined) > _POINTS:
             joined, known = thin(joined, _POINTS), 0
         elif len(joined) == known:
             return
         normals = np.zeros((len(joined), 3))
-        sums = np.zeros((len(joined), _SUMS))
+        sums = np.zeros((len(joined), SUMS))
         normals[:known] = self.normals[:known]
         sums[:known] = self._sums[:known]
         changed = extend_sums(joined, known, _PLANE_M, sums)
         normals[changed] = _normals(covariances(sums[changed]))
         self.points, self.normals, self._sums = joined, normals, sums
-        self._widest = int(np.ptp(joined, axis=0).argmax())
-        self._order = np.argsort(joined[:, self._widest], kind="stable")
-        self._sorted = joined[self._order]
-
-    @property
-    def in_order(self) -> tuple[FloatArray, IntArray, int]:
-        """(M, 3) points, sorted along the axis of their largest extent, the (M,) index of each in
-        `points`, and this axis.
-        """
-        return self._sorted, self._order, self._widest
+        widest = int(np.ptp(joined, axis=0).argmax())
+        order = np.argsort(joined[:, widest], kind="stable")
+        self.in_order = joined[order], order, widest
 
 
 def covariances(sums: FloatArray) -> FloatArray:
     """Return the (N, 3, 3) covariances of points from their (N, 10) sums: see `extend_sums`."""
     counts, totals = sums[:, 0, None, None], sums[:, 1:4]
-    return sums[:, _SQUARES] / counts - totals[:, :, None] * totals[:, None, :] / (counts * counts)
+    return sums[:, SQUARES] / counts - totals[:, :, None] * totals[:, None, :] / (counts * counts)
 
 
 def _normals(covariances: FloatArray) -> FloatArray:
@@ -112,16 +107,9 @@ def extend_sums(model: FloatArray, known: int, radius: float, sums: FloatArray) 
             )
             if x * x + y * y + z * z < radius * radius:
                 changed[i] = True
-                own[0] += 1
-                own[1] += x
-                own[2] += y
-                own[3] += z
-                own[4] += x * x
-                own[5] += x * y
-                own[6] += x * z
-                own[7] += y * y
-                own[8] += y * z
-                own[9] += z * z
+                terms = (1.0, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)
+                for k, term in enumerate(terms):
+                    own[k] += term
     return changed
 
 

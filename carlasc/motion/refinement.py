@@ -14,7 +14,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice, pairwise
 from typing import Self
@@ -22,7 +22,7 @@ from typing import Self
 import numpy as np
 
 from carlasc.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from carlasc.core.cells import first_of_cells
+from carlasc.core.cells import cells_of, first_of_cells
 from carlasc.core.choices import LoopMode
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import invert, multiply, small_motions, transform_points
@@ -94,8 +94,8 @@ class ThinnedScan:
     def of(cls, points: Float32Array, world_T_sensor: FloatArray) -> Self:
         """Choose from the (N, 3) points of a scan, metres, sensor frame, which should be static."""
         near = points[(np.abs(points) < _FAR_M).all(axis=1)]
-        chosen = near[first_of_cells(np.floor(near / np.float32(_THIN_M)).astype(np.int64))]
-        x, y, z = np.floor(transform_points(world_T_sensor, chosen) / _PLACE_M).astype(np.int64).T
+        chosen = near[first_of_cells(cells_of(near, _THIN_M))]
+        x, y, z = cells_of(transform_points(world_T_sensor, chosen), _PLACE_M).T
         measured = ((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) % _PLACES == 0
         return cls(chosen[~measured], chosen[measured])
 
@@ -200,12 +200,9 @@ def refine_poses(
         keep: called with the poses of the first scans, after each stretch but the last one.
     """
     count, poses = len(given), given.copy()
-    before, after, refined = (
-        np.full(count, np.nan),
-        np.full(count, np.nan),
-        np.zeros(count, np.bool_),
-    )
-    fits = np.ones(count, np.bool_)
+    before, after = np.full((2, count), np.nan)
+    refined, fits = np.zeros(count, np.bool_), np.ones(count, np.bool_)
+    made = RefinedPoses(given, poses, before, after, refined, fits)
     done = 0 if begun is None else len(begun.poses)
     if begun is not None:
         poses[:done] = begun.poses
@@ -246,19 +243,17 @@ def refine_poses(
                 measures = before[:end], after[:end], refined[:end], fits[:end]
                 keep(RefinedPoses(given[:end], poses[:end], *measures))
         if submaps is not None:
-            for row, scan, pose in zip(
-                range(begin, end), kept[rows], poses[begin:end], strict=True
-            ):
-                submaps.add(row, scan.used, scan.measured, pose)
+            for row in range(begin, end):
+                scan = kept[row - start]
+                submaps.add(row, scan.used, scan.measured, poses[row])
         begin = end
     # Beside vehicles that move along, poses may seem not to fit: one such stretch bars no loop.
     if submaps is not None and fits.mean() > 0.5:
         submaps.finish()
         closed, found = close_loops(submaps.done, poses)
         if len(found) and (always or _is_better(found[:, 2], found[:, 3])):
-            refined[:] = True
-            return RefinedPoses(given, closed, before, after, refined, fits, found)
-    return RefinedPoses(given, poses, before, after, refined, fits)
+            return replace(made, poses=closed, refined=np.ones_like(refined), loops=found)
+    return made
 
 
 def _may_return(given: FloatArray) -> bool:
@@ -276,14 +271,11 @@ def _may_return(given: FloatArray) -> bool:
 
 
 def _is_better(before: FloatArray, after: FloatArray) -> bool:
-    both = np.isfinite(before) & np.isfinite(after)
+    gain = before - after
+    both = np.isfinite(gain)
     if not both.any():
         return False
-    was, now, gain = (
-        float(before[both].mean()),
-        float(after[both].mean()),
-        before[both] - after[both],
-    )
+    was, now, gain = float(before[both].mean()), float(after[both].mean()), gain[both]
     error = float(gain.std()) * float(np.sqrt(_ALIKE / len(gain)))
     sure = now < min(_SURE * was, was - _SURELY_M) and was - now > _ERRORS * error
     return sure or now < min(_BETTER * was, was - _NEARER_M)

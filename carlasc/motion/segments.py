@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray, IntArray
+from carlasc.core.cells import numbered
 from carlasc.core.geometry import Transform, rotate_vectors, transform_points
 from carlasc.core.scans import Scan
 from carlasc.motion.paths import Segment
@@ -191,10 +192,11 @@ def static_actor_points(
 
 def _groups(key: IntArray) -> list[IntArray]:
     """Return the indices of each value of `key`, in the order in which the values occur first."""
-    _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
-    order = np.argsort(inverse, kind="stable")
-    parts = np.split(order, np.cumsum(np.bincount(inverse))[:-1])
-    return [parts[i] for i in np.argsort(first)]
+    if not len(key):
+        return []
+    first, number = numbered(key[:, None])
+    order = np.argsort(number, kind="stable")
+    return np.split(order, np.searchsorted(number[order], np.arange(1, len(first))))
 
 
 def _places(spread: FloatArray, own: IntArray) -> list[IntArray]:
@@ -218,10 +220,10 @@ def _join(points: FloatArray, velocity: FloatArray) -> IntArray:
     keys = np.concatenate(
         [np.floor(points / _CELL_M), np.round(velocity / _SAME_VELOCITY_M_S)], axis=1
     ).astype(np.int64)
-    _, cell = np.unique(keys, axis=0, return_inverse=True)
+    _, cell = numbered(keys)
     count = np.bincount(cell)
-    center = np.stack([np.bincount(cell, points[:, a]) for a in range(3)], axis=1) / count[:, None]
-    speed = np.stack([np.bincount(cell, velocity[:, a]) for a in range(3)], axis=1) / count[:, None]
+    sums = np.array([np.bincount(cell, values) for values in (*points.T, *velocity.T)])
+    center, speed = np.split((sums / count).T, 2, axis=1)
     offset = center[:, None] - center[None]
     ahead = speed / np.maximum(np.linalg.norm(speed, axis=1), 1e-9)[:, None]
     along2 = np.square(np.einsum("ijk,ik->ij", offset, ahead))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from carlasc.core.arrays import FloatArray, IntArray
-from carlasc.core.compiling import cached
+from carlasc.core.compiling import cached, inlined
 
 _HEADING_SPEED_M_S = 1.0  # above it, the heading is the direction of motion
 _SWEEPS = 12  # greatest number for Jacobi's method, which takes about five
@@ -105,6 +105,16 @@ def solve_positive(matrix: FloatArray, right: FloatArray) -> FloatArray:
     return solution
 
 
+@inlined
+def _turn(matrix: FloatArray, p: int, q: int, cos: float, sin: float) -> None:
+    """Turn the columns `p` and `q` of a matrix in their plane."""
+    for k in range(3):
+        matrix[k, p], matrix[k, q] = (
+            cos * matrix[k, p] - sin * matrix[k, q],
+            sin * matrix[k, p] + cos * matrix[k, q],
+        )
+
+
 @cached(error_model="python")
 def principal_axes(
     covariances: FloatArray,
@@ -141,28 +151,20 @@ def principal_axes(
                     )
                     cos = 1.0 / np.sqrt(tangent * tangent + 1.0)
                     sin = tangent * cos
-                    for k in range(3):
-                        a[k, p], a[k, q] = (
-                            cos * a[k, p] - sin * a[k, q],
-                            sin * a[k, p] + cos * a[k, q],
-                        )
-                    for k in range(3):
-                        a[p, k], a[q, k] = (
-                            cos * a[p, k] - sin * a[q, k],
-                            sin * a[p, k] + cos * a[q, k],
-                        )
-                    for k in range(3):
-                        v[k, p], v[k, q] = (
-                            cos * v[k, p] - sin * v[k, q],
-                            sin * v[k, p] + cos * v[k, q],
-                        )
+                    _turn(a, p, q, cos, sin)
+                    _turn(a.T, p, q, cos, sin)
+                    _turn(v, p, q, cos, sin)
         # The diagonal has no order; the normal of a plane is the vector of the smallest value.
-        order = np.argsort(np.array([a[0, 0], a[1, 1], a[2, 2]]))
-        for k in range(3):
-            values[n, k] = a[order[k], order[k]]
-            for i in range(3):
-                vectors[n, i, k] = v[i, order[k]]
+        diagonal = np.diag(a)
+        order = np.argsort(diagonal)
+        values[n], vectors[n] = diagonal[order], v[:, order]
     return values, vectors
+
+
+def squares_of(vectors: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the (K, K) sum of the (N,) weights times the squares, v v^T, of (N, K) vectors."""
+    squares = weights[:, None, None] * vectors[:, :, None] * vectors[:, None, :]
+    return np.asarray(squares.sum(axis=0))
 
 
 def nearest_rotation(matrix: FloatArray) -> FloatArray:
@@ -253,8 +255,10 @@ def resample(
     Returns:
         (A, 3) positions and (A, 3) velocities.
     """
-    path = np.stack([np.interp(at, seconds, positions[:, axis]) for axis in range(3)], axis=1)
-    speed = np.stack([np.interp(at, seconds, velocities[:, axis]) for axis in range(3)], axis=1)
+    path, speed = (
+        np.column_stack([np.interp(at, seconds, column) for column in values.T])
+        for values in (positions, velocities)
+    )
     beyond = np.minimum(at - seconds[0], 0) + np.maximum(at - seconds[-1], 0)
     return path + speed * beyond[:, None], speed
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
@@ -25,7 +25,6 @@ from carlasc.core.geometry import (
     Transform,
     invert,
     multiply,
-    rotate_vectors,
     rotation_z,
     transform_each,
 )
@@ -34,7 +33,9 @@ from carlasc.motion.bodies import BODY_MARGIN_M, Extent, Sizes, measure, surface
 from carlasc.motion.paths import (
     Path,
     Segment,
+    ends,
     headings_of_vehicle,
+    in_body,
     is_static,
     length_of,
     path_of,
@@ -49,7 +50,6 @@ _STATIC_M = 0.5  # the visible part of a static actor may seem to move this far
 # No actor, with its margins, is longer, wider or higher: a larger one has points of other things.
 LONGEST_M, _WIDEST_M, _HIGHEST_M = 30.0, 4.2, 5.0
 _SURE = 0.8  # actors with less confidence are doubtful
-_END = 0.02  # share of the points of a scan beyond each end of what it shows
 _ASIDE = 0.1  # weight of an end that is not turned to the sensor
 _AGREE_M = 0.5  # an end that is farther from its usual place is that of a part of the actor
 _ROUNDS, _TURNS_RAD = 3, 0.1
@@ -107,13 +107,15 @@ class Track:
 
     def pose(self, frame: int) -> Transform | None:
         """Return (4, 4) world_T_actor at a frame; None if the track does not extend to it."""
-        row = frame - self.first
-        return self.world_T_actor[row] if 0 <= row < len(self.world_T_actor) else None
+        return self._at(self.world_T_actor, frame)
 
     def velocity_at(self, frame: int) -> FloatArray | None:
         """Return (3,) m/s, world, at a frame; None if the track does not extend to it."""
+        return self._at(self.velocity, frame)
+
+    def _at(self, values: FloatArray, frame: int) -> FloatArray | None:
         row = frame - self.first
-        return self.velocity[row] if 0 <= row < len(self.velocity) else None
+        return values[row] if 0 <= row < len(values) else None
 
     def between(self, first: int, last: int) -> Track:
         """Return the track at the frames from `first` to `last` only, which is small enough to send
@@ -181,7 +183,7 @@ def make_track(
         positions, velocities, headings = estimated
         chain = [segment.at_frame(v) for segment, v in zip(chain, velocities, strict=True)]
         observations = [segment.points for segment in chain]
-        if path is None and is_static(observations, positions, headings, seconds):
+        if path is None and is_static(observations, estimated, seconds):
             positions, velocities, headings = (
                 np.zeros_like(values) for values in (positions, velocities, headings)
             )
@@ -286,13 +288,10 @@ def _visible_ends(
         y, metres, actor frame, and (F, 2, 2) how much each is turned to the sensor.
     """
     turns = np.stack([rotation_z(heading) for heading in headings])
-    backwards, ends = invert(turns), list[FloatArray]()
-    for segment, turn, position in zip(chain, backwards, positions, strict=True):
-        own = rotate_vectors(turn, segment.points - position)[:, :2]
-        ends.append(np.quantile(own, (_END, 1 - _END), axis=0))
+    body = in_body([segment.points for segment in chain], positions, headings)
+    faces = np.array([ends(points[:, :2]) for points in body])
     origins = np.stack([segment.origin for segment in chain]) - positions
-    places = multiply(backwards[:, :3, :3], origins[..., None])[:, None, :2, 0]
-    faces = np.array(ends)
+    places = multiply(invert(turns)[:, :3, :3], origins[..., None])[:, None, :2, 0]
     beyond = (np.median(faces, axis=0) - places) * np.array([[1], [-1]])
     distance = np.maximum(np.linalg.norm(places, axis=2, keepdims=True), 1e-6)
     return turns[:, :2, :2], faces, _ASIDE + np.clip(beyond / distance, 0, 1)
@@ -394,8 +393,7 @@ def _frames_around(
 
     Frames without a scan are interpolated, and extrapolated by the mean period.
     """
-    known = np.array(sorted(times))
-    seconds = np.array([times[int(frame)] for frame in known])
+    known, seconds = (np.array(values) for values in zip(*sorted(times.items()), strict=True))
     period = (
         float(seconds[-1] - seconds[0]) / float(known[-1] - known[0]) if len(known) > 1 else 0.1
     )
@@ -478,47 +476,29 @@ class MovingActors:
 
     def to_bytes(self, key: str, *, is_compressed: bool = True) -> bytes:
         """Return the content of a file with these actors. `key` is a digest of their source."""
-        table = []
-        poses = []
-        velocities = []
-        bounds = []
-        members = []
-        frames = []
-        surfaces = []
+        table, bounds, frames, members = [], [], [], list[AnyIntArray]()
+        tracks = self.tracks.values()
         for number, track in self.tracks.items():
-            table.append(
-                (
-                    number,
-                    track.label,
-                    track.instance,
-                    track.first,
-                    len(track.world_T_actor),
-                    track.extent.points,
-                    track.rigid,
-                    len(track.surface),
-                )
-            )
-            poses.append(track.world_T_actor)
-            velocities.append(track.velocity)
-            surfaces.append(track.surface)
-            extent = track.extent
+            extent, sizes = track.extent, (len(track.world_T_actor), track.extent.points)
+            about = number, track.label, track.instance, track.first
+            table.append((*about, *sizes, track.rigid, len(track.surface)))
             corners = [track.lower, track.upper, extent.lower, extent.upper]
             bounds.append(
                 np.concatenate([*corners, extent.faces, extent.seen_from, [track.confidence]])
             )
-            for frame, own in track.members.items():
-                members.append(own)
-                frames.append((number, frame, len(own)))
+            members += track.members.values()
+            frames += [(number, frame, len(own)) for frame, own in track.members.items()]
         # Tables of numbers, one row per track or per scan of a track, and the values of all tracks
         # one after the other: a file of ten arrays is read at once, whatever the number of tracks.
-        facts = {"key": key, "summary": self.summary, "seen": self.seen}
-        about = json.dumps(facts).encode()
+        facts = json.dumps({"key": key, "summary": self.summary, "seen": self.seen})
         arrays = {
-            "about": np.frombuffer(about, np.uint8),
+            "about": np.frombuffer(facts.encode(), np.uint8),
             "table": np.array(table, np.int64).reshape(-1, 8),
-            "poses": np.concatenate([np.empty((0, 4, 4)), *poses]),
-            "velocities": np.concatenate([np.empty((0, 3)), *velocities]),
-            "surfaces": np.concatenate([np.empty((0, 3), np.float32), *surfaces]),
+            "poses": np.concatenate([np.empty((0, 4, 4)), *(t.world_T_actor for t in tracks)]),
+            "velocities": np.concatenate([np.empty((0, 3)), *(t.velocity for t in tracks)]),
+            "surfaces": np.concatenate(
+                [np.empty((0, 3), np.float32), *(t.surface for t in tracks)]
+            ),
             "bounds": np.array(bounds, np.float64).reshape(-1, 20),
             "members": np.concatenate([np.empty(0, np.int32), *members]).astype(np.int32),
             "frames": np.array(frames, np.int64).reshape(-1, 3),
@@ -547,12 +527,8 @@ class MovingActors:
             about = parse_json(file.read("about", ArrayFormat(("u1",), (None,))).tobytes(), where)
         with reading(where, "tracks written by regrid", "remove it"):
             tracks = _tracks(arrays)
-            ends = np.cumsum(arrays["moving_frames"][:, 1])[:-1]
-            parts = np.split(arrays["moving"], ends)
-            moving = {
-                int(frame): own
-                for (frame, _), own in zip(arrays["moving_frames"], parts, strict=False)
-            }
+            moved = _divided(arrays["moving"], arrays["moving_frames"], 1)
+            moving = {frame: own for (frame, _), own in moved}
             summary = tuple(about["summary"])
             own = tuple(arrays["own"])
             seen = int(about["seen"])
@@ -573,23 +549,27 @@ def is_doubtful(confidence: float) -> bool:
 
 
 def _tracks(arrays: Mapping[str, AnyArray]) -> dict[int, Track]:
+    table, frames = arrays["table"], arrays["frames"]
     members: dict[int, dict[int, AnyIntArray]] = {}
-    offset = 0
-    for number, frame, count in arrays["frames"].tolist():
-        members.setdefault(number, {})[frame] = arrays["members"][offset : offset + count]
-        offset += count
-    tracks, row, point = {}, 0, 0
-    for (number, label, instance, first, length, points, rigid, size), bounds in zip(
-        arrays["table"].tolist(), arrays["bounds"], strict=True
+    for (number, frame, _), own in _divided(arrays["members"], frames, 2):
+        members.setdefault(number, {})[frame] = own
+    tracks = {}
+    for (row, poses), (_, velocity), (_, surface), bounds in zip(
+        _divided(arrays["poses"], table, 4),
+        _divided(arrays["velocities"], table, 4),
+        _divided(arrays["surfaces"], table, 7),
+        arrays["bounds"],
+        strict=True,
     ):
+        number, label, instance, first, _, points, rigid, _ = row
         rear, front, low, high = (bounds[12:16] > 0).tolist()
         tracks[number] = Track(
             label,
             instance,
             members.get(number, {}),
             first,
-            arrays["poses"][row : row + length],
-            arrays["velocities"][row : row + length],
+            poses,
+            velocity,
             bounds[0:3],
             bounds[3:6],
             Extent(
@@ -600,11 +580,16 @@ def _tracks(arrays: Mapping[str, AnyArray]) -> dict[int, Track]:
                 tuple(bounds[16:19].tolist()),
             ),
             bool(rigid),
-            arrays["surfaces"][point : point + size],
+            surface,
             float(bounds[19]),
         )
-        row, point = row + length, point + size
     return tracks
+
+
+def _divided(values: AnyArray, rows: AnyArray, count: int) -> Iterator[tuple[list[int], AnyArray]]:
+    """Yield the rows of a table, each with its values, of which a column has the number."""
+    parts = np.split(values, np.cumsum(rows[:, count])[:-1])
+    return zip(rows.tolist(), parts, strict=False)  # without rows, there is one empty part
 
 
 def _summarize(track: Track) -> dict[str, Any]:

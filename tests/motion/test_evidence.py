@@ -11,7 +11,9 @@ from carlasc.motion.evidence import HORIZON_S, EvidenceScan, find_evidence
 
 def moved_of(evidence):
     flags = np.zeros(evidence.count, bool)
-    flags[np.concatenate([np.empty(0, int), *evidence.clusters])] = True
+    flags[
+        np.concatenate([np.empty(0, int), *(one.segment.members for one in evidence.clusters)])
+    ] = True
     return flags
 
 
@@ -103,10 +105,11 @@ def test_labels_name_clusters_and_keep_them_apart():
 
     scans = [scan for scan, _ in film(together, labels=True)]
     found = list(find_evidence(scans, movable={CAR, PERSON}))[20]
-    assert sorted(found.labels) == [PERSON, CAR]
-    for members, label in zip(found.clusters, found.labels, strict=True):
-        assert (scans[20].labels[members] == label).all()
-    assert not any((scans[20].labels[members] == GROUND).any() for members in found.clusters)
+    segments = [cluster.segment for cluster in found.clusters]
+    assert sorted(segment.label for segment in segments) == [PERSON, CAR]
+    for segment in segments:
+        labels = scans[20].labels[segment.members]
+        assert (labels == segment.label).all() and not (labels == GROUND).any()
 
 
 def test_scans_are_given_back_after_the_horizon():

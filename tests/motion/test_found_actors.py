@@ -11,8 +11,9 @@ from helpers.scenes.moving_scenes import CAR, PERSON, WALL, WALLS, box, car, fil
 
 from carlasc.captures.settings import Lidar
 from carlasc.motion import found_actors
-from carlasc.motion.evidence import FreeSpaceEvidence, find_evidence
+from carlasc.motion.evidence import FreeSpaceEvidence, MovedCluster, find_evidence
 from carlasc.motion.found_actors import ActorFollower
+from carlasc.motion.paths import Segment
 from carlasc.motion.tracks import MovingActors
 
 
@@ -82,10 +83,11 @@ def test_moved_points_are_told_for_every_frame():
 
 def test_what_is_free_on_one_side_in_time_only_does_not_move_by_itself():
     follower, near = ActorFollower(), np.empty(0, np.int64)
-    clusters = np.arange(10), np.arange(10, 20)
-    points = (np.zeros((10, 3)), np.full((10, 3), 30.0))
-    parts = (clusters, points, (0, 0), (10, 10), (1, 9), (0, 0))
-    follower.add(FreeSpaceEvidence(0, 0.0, 20, *parts, np.eye(4), near))
+    clusters = tuple(
+        MovedCluster(Segment(0, 0, np.arange(10) + first, np.full((10, 3), x), None), 10, passed, 0)
+        for first, x, passed in ((0, 0.0, 1), (10, 30.0, 9))
+    )
+    follower.add(FreeSpaceEvidence(0, 0.0, 20, clusters, np.eye(4), near))
     assert follower.moved[0].tolist() == list(range(10, 20))
 
 

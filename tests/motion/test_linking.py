@@ -62,6 +62,16 @@ def test_parts_of_one_number_are_one_actor():
     assert chain[-1].points.shape == (16, 3)
 
 
+def test_parts_keep_the_times_of_their_points():
+    parts = [
+        replace(observation(1, 1, has_flow=False, dx=dx), times=np.full(8, late))
+        for dx, late in ((0.0, 0.01), (3.0, 0.02))
+    ]
+    ((_, joined),) = linked({0: [observation(0, 1, has_flow=False)], 1: parts})
+    assert joined.times.tolist() == [0.01] * 8 + [0.02] * 8
+    assert np.allclose(joined.at_frame(np.ones(3)).points[8:], parts[1].points - 0.02)
+
+
 def test_a_number_that_comes_back_is_the_same_actor_anywhere_and_after_ten_seconds_another_one():
     for pause, chains in ((12, 1), (98, 1), (102, 2)):
         assert (

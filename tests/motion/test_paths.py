@@ -180,7 +180,8 @@ def test_observations_are_laid_on_each_other_near_what_is_known():
 class TestStatic:
     def static(self, observations, velocity=(0.0, 0.0, 0.0)):
         positions = np.outer(SECONDS, velocity) + (10, 0, 0)
-        return is_static(observations, positions, np.zeros(len(SECONDS)), SECONDS)
+        path = positions, np.zeros_like(positions), np.zeros(len(SECONDS))
+        return is_static(observations, path, SECONDS)
 
     def test_observations_at_one_place_are_of_a_static_actor(self):
         assert self.static([box_surface((4, 2, 1.5), 300, seed) for seed in range(25)], (0.5, 0, 0))
@@ -197,7 +198,8 @@ class TestStatic:
         assert not self.static([rng.uniform(-4, 4, (12, 3)) for _ in SECONDS])
 
     def test_a_single_observation_is_of_a_static_actor(self):
-        assert is_static([np.zeros((5, 3))], np.zeros((1, 3)), np.zeros(1), np.zeros(1))
+        path = np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1)
+        assert is_static([np.zeros((5, 3))], path, np.zeros(1))
 
 
 def test_a_path_goes_on_evenly_on_both_sides_of_where_it_starts():
