@@ -91,11 +91,9 @@ _OWN_SHARE = 0.5  # an actor with so many points in these cells is none
 # A cluster is split between chains of so many observations, whose middles are expected so near to
 # it, and whose velocities differ by so much. So many points of their last ones stand for them.
 _KNOWN, _NEAR_M, _APART_M_S, _MODEL = 3, 0.2, 1.0, 80
-# A vehicle that is so long, and turns by so much, may have a joint: then its rear half is no wider
-# than a vehicle, and points of its front are so far beside it. Shares of points beyond each end,
-# and least number of points.
-_LONG_M, _BENDS_RAD, _WIDEST_M, _ASIDE_M = 9.0, 0.3, 3.0, 0.3
-_END, _MIN_PART = 0.02, 10
+# A vehicle that is so long, and turns by so much, may have a joint: then points of its front are
+# so far beside its rear half. Shares of points beyond each end, and least number of points.
+_LONG_M, _BENDS_RAD, _ASIDE_M, _END, _MIN_PART = 9.0, 0.3, 0.3, 0.02, 10
 _KEPT = 400  # points of an observation that are kept
 _SAMPLES = 300  # points of an observation that are compared with those of another
 
@@ -449,9 +447,10 @@ class _ActorChain:
             for link, own in zip(self.links, beside, strict=True)
             if own.sum() >= _MIN_PART
         ]
-        if len(parts) < _MIN_OBSERVATIONS:
+        # Two vehicles that were taken for one have scans that show one of them only.
+        if len(parts) < _MIN_OBSERVATIONS or any(own.all() for own in beside):
             return actor, []
-        left = [s.part(~own | own.all()) for s, own in zip(segments, beside, strict=True)]
+        left = [segment.part(~own) for segment, own in zip(segments, beside, strict=True)]
         ahead = _ActorChain(parts, self.numbers)
         return actor._replace(segments=left, path=behind), [ahead]
 
