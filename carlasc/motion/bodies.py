@@ -17,12 +17,11 @@ from carlasc.core.arrays import AnyIntArray, Float32Array, FloatArray, IntArray
 
 _TRIM = 0.01  # share of points that may be outside the body: outliers, points of a neighbour
 # a face is visible if scans with so many points, and this share, see it
-_FACE_POINTS, _FACE_SHARE = 12, 0.02
+_FACE_POINTS, _FACE_SHARE = (
+    12,
+    0.02,
+)
 _FACE_SINE = 0.26  # a scan sees a face if its rays meet the face at 15 degrees or more
-# The slopes of neighbouring channels differ by more. Where the channel above passed lower than the
-# top less this error, a scan shows a part of the actor; of the others, this quantile counts. The
-# top is known if that one passed within the last distance.
-_CHANNELS, _TOP_M, _LOW, _NARROW_M = 0.003, 0.05, 0.25, 0.2
 _ALIKE = 0.15  # actors are similar if their known sizes differ by this fraction
 # No vehicle is shorter, or narrower, than these shares of the usual size of its kind; from the
 # second share on, all of it was seen.
@@ -30,7 +29,10 @@ _SHORTEST = (0.5, 0.7), (0.8, 0.9)
 _HIGHER = 1.6  # the height may grow by less than this factor
 _EXAMPLES = 3  # a size is learned from at least so many actors, and a shape from at most so many
 # cells of surfaces, and cells in which surfaces of several actors are compared
-_CELL_M, _BIN_M = 0.1, 0.2
+_CELL_M, _BIN_M = (
+    0.1,
+    0.2,
+)
 _ACTORS_WIDE_M = 1.3  # narrower vehicles have two wheels
 # Of cars, and of longer or higher vehicles: wider ones have points of a neighbour, or are smeared.
 # They are cut to the usual width, gradually over this width.
@@ -66,7 +68,6 @@ _ERRORS_M = {
 LENGTH, WIDTH = 0, 1
 # Length and width, metres, of vehicles with two wheels, cars, vans, and lorries and buses.
 _TWO_WHEELS, _CAR, _VAN, _LORRY = (1.8, 0.7), (4.4, 1.85), (5.4, 2.0), (7.5, 2.5)
-_HEIGHTS_M = 1.4, 2.2, 3.0  # of the visible parts of cars, vans, and lorries and buses
 # Nothing changes in a step: sizes and shapes change gradually between two limits. From vehicles
 # with two wheels to cars, by width and by length; from cars to vans, by height; to lorries, by
 # width, height and length.
@@ -87,7 +88,6 @@ class Extent:
         points: number of points of the observations.
         seen_from: (3,) where the sensor is from the middle of the box, metres, actor frame: mean
             over the points.
-        gap_m: how far above the upper corner a ray passed, metres; 0 if the top is known.
     """
 
     lower: FloatArray
@@ -95,7 +95,6 @@ class Extent:
     faces: tuple[bool, bool, bool, bool]
     points: int
     seen_from: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    gap_m: float = 0.0
 
     @property
     def size(self) -> FloatArray:
@@ -157,22 +156,7 @@ def measure(points: FloatArray, counts: AnyIntArray, sensors: FloatArray) -> Ext
         sensors: (F, 3) position of the sensor in each scan, metres, actor frame.
     """
     lower, upper = np.quantile(points, (_TRIM, 1 - _TRIM), axis=0)
-    scans = zip(np.split(points, np.cumsum(counts)[:-1]), sensors, strict=True)
-    gaps = [sensor[2] + _passed_above(seen - sensor) - upper[2] for seen, sensor in scans]
-    gap_m = float(np.quantile([gap for gap in gaps if gap > -_TOP_M] or 0.0, _LOW))
-    extent = seen_from(lower, upper, counts, sensors)
-    return replace(extent, gap_m=gap_m) if gap_m > _NARROW_M else extent
-
-
-def _passed_above(seen: FloatArray) -> float:
-    """Return the height at which the channel above those of (M, 3) points passed, metres from the
-    sensor; -inf if there is one channel.
-    """
-    distance = np.maximum(np.hypot(seen[:, 0], seen[:, 1]), 1e-6)
-    slopes = seen[:, 2] / distance
-    top = slopes.argmax()
-    below = slopes[slopes < slopes[top] - _CHANNELS]
-    return float(distance[top] * (2 * slopes[top] - (below.max() if len(below) else np.inf)))
+    return seen_from(lower, upper, counts, sensors)
 
 
 def seen_from(
@@ -250,14 +234,9 @@ class Sizes:
                 upper[axis] += missing
             else:
                 lower[axis] -= missing
-        # Other things may hide the wheels, or the lowest ray may pass above them. What is missing
-        # beyond the ground is at the top, between two channels.
+        # other things may hide the wheels, or the lowest ray may pass above them
         if not extent.exemplary:
-            size, hidden = upper - lower, max(self._sensor_m - extent.below_sensor_m, 0.0)
-            missing = max(self._height(label, size, hidden, extent.gap_m) - size[2], 0.0)
-            above = float(np.clip(missing - hidden, 0.0, extent.gap_m))
-            upper[2] += above
-            lower[2] -= missing - above
+            lower[2] -= max(self._height(label, upper - lower) - (upper[2] - lower[2]), 0.0)
         # the top of a lorry may be above the highest ray
         is_long = _share(upper[LENGTH] - lower[LENGTH], _LORRY_LONG_M)
         upper[2] += is_long * max(lower[2] + _LORRY_TOP_M - upper[2], 0.0)
@@ -284,24 +263,16 @@ class Sizes:
                 return float(np.median(chosen[:, axis]))
         return _table(extent, axis)
 
-    def _height(self, label: int, size: FloatArray, hidden: float, gap_m: float) -> float:
+    def _height(self, label: int, size: FloatArray) -> float:
         """Return the height of actors that are as long and as wide as `size`, (3,) metres; without
         such actors, its own height.
-
-        If a ray passed `gap_m` above, it is below that ray, and above what was seen with the
-        `hidden` metres below it; without such actors, a usual height, or halfway.
         """
         sizes = self._known.get(label, np.empty((0, 3)))
         alike = sizes[
             (np.abs(sizes - size) < _ALIKE * size)[:, :2].all(axis=1)
             & (sizes[:, 2] < _HIGHER * size[2])
-        ][:, 2]
-        usual = float(size[2])
-        if gap_m:
-            low, high = usual + hidden, usual + hidden + gap_m
-            alike = alike[(alike > low) & (alike < high)]
-            usual = next((one for one in _HEIGHTS_M if low < one < high), (low + high) / 2)
-        return float(np.median(alike)) if len(alike) >= _EXAMPLES else usual
+        ]
+        return float(np.median(alike[:, 2])) if len(alike) >= _EXAMPLES else float(size[2])
 
     def surface(
         self, label: int, lower: FloatArray, upper: FloatArray, extent: Extent

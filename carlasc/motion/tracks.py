@@ -249,10 +249,7 @@ def _with_body(track: Track, sizes: Sizes) -> Track:
     poses = track.world_T_actor.copy()
     poses[:, :3, 3] += multiply(poses[:, :3, :3], middle[:, None])[..., 0]
     seen = replace(
-        track.extent,
-        lower=track.extent.lower - middle,
-        upper=track.extent.upper - middle,
-        gap_m=0.0,
+        track.extent, lower=track.extent.lower - middle, upper=track.extent.upper - middle
     )
     return replace(
         track,

@@ -1,7 +1,5 @@
 """How large an actor is, although no scan saw all of it."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -44,35 +42,6 @@ def test_a_sensor_sees_the_faces_that_are_turned_to_it(sensor, faces):
     assert found.seen_from[:2] == pytest.approx(sensor, abs=0.15)
     assert found.points == 200
     assert np.allclose(found.size, (4.0, 1.8, 1.5), atol=0.15)
-
-
-@pytest.mark.parametrize(("sensor_z", "gap"), [(0.3, 0.4), (-1.0, 0.4)])
-def test_the_channel_above_those_on_an_actor_limits_its_height(sensor_z, gap):
-    y = np.linspace(-0.9, 0.9, 50)
-    rear = np.concatenate([np.column_stack([0 * y, y, 0 * y + z]) for z in (0.0, 0.4, 0.8)])
-    near = measured([rear], np.array([[-20.0, 0, sensor_z]]))
-    assert near.gap_m == pytest.approx(gap, abs=0.02)
-    fine = np.concatenate([rear - (0, 0, z) for z in (0.0, 0.1, 0.2, 0.3)])  # a known top
-    assert measured([fine], np.array([[-20.0, 0, sensor_z]])).gap_m == 0
-
-
-@pytest.mark.parametrize(
-    ("gap", "learned", "height"),
-    [
-        (0.0, (), 1.8),
-        (0.6, (), 2.2),  # a van
-        (0.3, (), 1.95),  # halfway
-        (0.6, (1.9, 2.0, 2.1), 2.0),
-        (0.6, (1.4, 1.5, 2.6), 2.2),  # others are not as high
-    ],
-)
-def test_a_top_between_two_channels_is_that_of_similar_actors(gap, learned, height):
-    seen = replace(extent((5.0, 1.9, 1.8), (True, False, True, False)), gap_m=gap)
-    places = [(-20.0, 0.0, 1.9 - h / 2) for h in learned]  # of the sensor, 1.9 m above the ground
-    sizes = [extent((5.0, 1.9, h), EVERY_SIDE, at) for h, at in zip(learned, places, strict=True)]
-    lower, upper = Sizes([(CAR, one, NO_SURFACE) for one in sizes]).complete(CAR, seen)
-    assert upper[2] - lower[2] == pytest.approx(height)
-    assert lower[2] == -0.9
 
 
 def test_a_face_counts_from_twelve_points_and_two_percent_of_them():
