@@ -23,7 +23,6 @@ import carlasc
 from carlasc import FromScans, GridSpec, Run, Voting
 from carlasc.core import CameraModel, invert, transform_points
 from carlasc.core.cameras import Lens
-from carlasc.groundtruth.inputs import stored_views
 from carlasc.groundtruth.seen import see_voxels
 from carlasc.inspection.image_alignment import compare_images
 from carlasc.storage import cameras_of, read_image, scan_T_camera
@@ -273,7 +272,9 @@ def seen_of(folder: Path, name: str, frames: int) -> NDArray[np.float64]:
     )
     made, given, answers = _only(out), _only(folder / "drive"), list[NDArray[np.bool_]]()
     for frame in np.linspace(0, len(given.frames("points")) - 1, frames).astype(int).tolist():
-        grid, views = made.grid("evaluation", frame), stored_views(given, frame)
+        grid = made.grid("evaluation", frame)
+        cameras = cameras_of(given).values()
+        views = [(camera, scan_T_camera(given, camera, frame)) for camera in cameras]
         known = np.flatnonzero(grid.known.reshape(-1))[::SAMPLED]
         ours, plain = made.read("evaluation/seen", frame), see_voxels(grid.labels > 0, spec, views)
         said = [seen.reshape(-1)[known] for seen in (ours, plain)]
