@@ -214,7 +214,8 @@ def compare_results(root: Path, attempt: Attempt) -> None:
     """Put results into one table, in all its forms."""
     table = attempt(lambda: carlasc.scores([root / "a.json", root / "b.json"], mixed=True))
     if table is not None:
-        for form in (table.table, table.to_markdown, table.to_latex, table.to_html):
+        figures = table.table()
+        for form in (figures.to_markdown, figures.to_latex, table.to_html):
             attempt(form)
 
 
